@@ -43,7 +43,13 @@ fn latest(runs: &Path, name: Option<&str>) -> Result<PathBuf, String> {
         (is_run && named).then(|| (time.to_owned(), number.unwrap_or(1)))
     };
     let entries = std::fs::read_dir(runs)
-        .map_err(|error| format!("there is no folder {} here: {error}", runs.display()))?;
+        .map_err(|error| match error.kind() {
+            std::io::ErrorKind::NotFound => format!(
+                "there is no folder {} here: a run makes it; name the run's folder, or change to the folder above it",
+                runs.display()
+            ),
+            _ => format!("{}: {error}", runs.display()),
+        })?;
     let folders: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
     let newest = (folders.iter())
         .filter_map(|folder| Some((wanted(folder)?, folder)))

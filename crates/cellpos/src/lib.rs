@@ -85,7 +85,7 @@ fn command_line() -> clap::Command {
     let groups = commands::groups(&command);
     // The groups take the place of clap's one long list.
     command.help_template(format!(
-        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n\n{groups}\n{{options}}{{after-help}}"
+        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n\n{groups}\nOptions of every command:\n{{options}}{{after-help}}"
     ))
 }
 

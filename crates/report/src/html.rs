@@ -4,7 +4,7 @@ use crate::draw;
 use crate::figure::{Figure, slug};
 use crate::picture::{Picture, base64};
 use crate::style::PAGE_STYLE;
-use crate::svg::{STYLE, escape, set};
+use crate::svg::{STYLE, escape, set, set_together};
 use crate::table::{Emphasis, Table};
 use crate::typeset::typeset;
 use std::fmt::Write;
@@ -113,6 +113,11 @@ impl Report {
         self.push(Block::List(items))
     }
 
+    /// Adds the command that made the page, as its last section: it repeats what was done.
+    pub fn command(&mut self, line: &str) -> &mut Self {
+        self.section("Command").verbatim(line)
+    }
+
     /// Adds text as it stands, in letters of equal width: a command line, a file.
     pub fn verbatim(&mut self, text: &str) -> &mut Self {
         self.push(Block::Verbatim(text.to_owned()))
@@ -211,10 +216,14 @@ impl Report {
                 Block::Table(table) => table.html(&mut out),
                 Block::Result(status, text) => {
                     let (class, sign) = (status.class(), status.sign());
-                    let _ = writeln!(out, "<p class=\"result {class}\">{sign}{}</p>", set(text));
+                    let _ = writeln!(
+                        out,
+                        "<p class=\"result {class}\">{sign}{}</p>",
+                        set_together(text)
+                    );
                 }
                 Block::Lead(text) => {
-                    let _ = writeln!(out, "<p class=\"lead\">{}</p>", set(text));
+                    let _ = writeln!(out, "<p class=\"lead\">{}</p>", set_together(text));
                 }
                 Block::Fold(title) => {
                     let _ = writeln!(out, "<details><summary>{}</summary>", set(title));

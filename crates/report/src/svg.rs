@@ -57,6 +57,24 @@ pub(crate) fn set(text: &str) -> String {
     escape(&typeset(text))
 }
 
+/// As [`set`], a number and its unit on one line.
+pub(crate) fn set_together(text: &str) -> String {
+    const UNITS: [&str; 10] = [
+        "%", "nm", "\u{b5}m", "ms", "s", "min", "h", "Hz", "dB", "/s",
+    ];
+    let mut out = String::with_capacity(text.len());
+    for word in set(text).split_inclusive(' ') {
+        let name = word.trim_end_matches([' ', '.', ',', ';', ':', ')']);
+        if UNITS.contains(&name) && out.ends_with(' ') {
+            out.pop();
+            let after_number = out.ends_with(|c: char| c.is_ascii_digit());
+            out.push(if after_number { '\u{a0}' } else { ' ' });
+        }
+        out.push_str(word);
+    }
+    out
+}
+
 /// A coordinate to a tenth of a pixel, as short as it goes.
 pub(crate) fn px(value: f64) -> String {
     let tenths = if value.is_finite() {

@@ -1,7 +1,7 @@
 //! How a run ended, in sentences: what was seen, what was expected, what to do.
 
 use crate::failure::{Failure, describe};
-use crate::words::{is_odd, safe_reason};
+use crate::words::{is_odd, of_what_is_followed, safe_reason};
 use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
 use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
 use cellpos_runtime::recorder::RecorderFault;
@@ -218,13 +218,14 @@ impl Clues {
             ),
             EndKind::Safe => self.safe(summary.safe_reason, expected),
         };
+        let said = |sentence: String| of_what_is_followed(&sentence, expected.cell);
         Ended {
             kind,
             refusal: refusal.filter(|_| kind == EndKind::ArmingRefused),
             reason: summary.safe_reason,
-            seen,
-            expected: wanted,
-            to_do,
+            seen: said(seen),
+            expected: said(wanted),
+            to_do: said(to_do),
         }
     }
 

@@ -25,6 +25,27 @@ impl Level {
     }
 }
 
+/// A sentence of the program about what is followed: a cell, if it is one, where the sentence has a bead.
+pub fn of_what_is_followed(sentence: &str, cell: bool) -> String {
+    if !cell {
+        return sentence.to_owned();
+    }
+    let mut out = String::with_capacity(sentence.len());
+    let mut rest = sentence;
+    while let Some(at) = rest.find("bead") {
+        let (before, found) = rest.split_at(at);
+        let after = &found["bead".len()..];
+        let inside = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_');
+        let end = after.strip_prefix('s').unwrap_or(after);
+        let alone = !before.ends_with(inside) && !end.starts_with(inside);
+        out.push_str(before);
+        out.push_str(if alone { "cell" } else { "bead" });
+        rest = after;
+    }
+    out.push_str(rest);
+    out
+}
+
 /// Why Safe was latched, as the end of a sentence.
 pub fn safe_reason(reason: SafeReason) -> &'static str {
     match reason {
@@ -284,4 +305,19 @@ fn disk_slow(unconfirmed_ms: f64, rows: u64, limit_ms: f64) -> String {
 
 fn plural(count: u64, one: &'static str, many: &'static str) -> &'static str {
     if count == 1 { one } else { many }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::of_what_is_followed;
+
+    #[test]
+    fn a_cell_is_called_so_and_names_stay() {
+        let sentence = "the bead was lost, two beads; lose-bead, bead_um, a beaded line";
+        assert_eq!(
+            of_what_is_followed(sentence, true),
+            "the cell was lost, two cells; lose-bead, bead_um, a beaded line"
+        );
+        assert_eq!(of_what_is_followed(sentence, false), sentence);
+    }
 }

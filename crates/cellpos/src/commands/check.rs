@@ -221,12 +221,25 @@ fn json(script: &Script, check: &Check) -> serde_json::Value {
 }
 
 fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
-    let mut report = Report::new(&format!("Script {}", script.name));
-    report.lead(&crate::output::command_line());
+    let mut report = Report::new(&format!("Check of {}", script.file));
+    report.lead(&format!(
+        "Task: check the script {} against the model and the limits of the rig, before it runs. All figures are calculated; nothing moved.",
+        script.file
+    ));
     match check.violations.len() {
         0 => report.result(
             Emphasis::Good,
-            "The script can run within the limits of this rig.",
+            &format!(
+                "The script can run within the limits of this rig: {:.1} s without waits, {} cycles. The PZT needs {:.2} to {:.2} um of its \
+                 {} to {} um; all positions could be larger by a factor of {}.",
+                check.duration_s,
+                check.cycles,
+                check.pzt_um.0,
+                check.pzt_um.1,
+                limits.low_um,
+                limits.high_um,
+                factor(check)
+            ),
         ),
         1 => report.result(
             Emphasis::Bad,
@@ -290,5 +303,6 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
     }
     report.section("Script");
     report.verbatim(&script.text);
+    report.command(&crate::output::command_line());
     report
 }

@@ -57,7 +57,7 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 1.0, requires = "collect", help_heading = ON_A_RIG)]
     effort: f64,
     /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
-    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", requires = "collect")]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", help_heading = ON_A_RIG, requires = "collect")]
     ideal: Option<bool>,
     /// Seed of the emulated rig and of the excitations [default: that of rig.toml].
     #[arg(long, requires = "collect", help_heading = ON_A_RIG)]
@@ -281,12 +281,28 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
         output::write(path, text)?;
     }
     if let Some(path) = &args.report {
+        let count = collected.len();
         let collected = collected.iter().map(|one| one.file.as_path());
-        let title = heading(args.data.iter().map(PathBuf::as_path).chain(collected));
+        let records = heading(args.data.iter().map(PathBuf::as_path).chain(collected));
+        let model = match &args.base {
+            Some(_) => "a linear model fitted to the records".to_owned(),
+            None => format!("the model {}", args.model),
+        };
+        let title = match (&args.base, args.data.len() + count) {
+            (Some(_), 1) => "what one record has beyond a linear model".to_owned(),
+            (Some(_), n) => format!("what {n} records have beyond a linear model"),
+            (None, 1) => format!("{} against one record", args.model),
+            (None, n) => format!("{} against {n} records", args.model),
+        };
+        let lead = format!(
+            "Task: find what {model} lacks, compared with {records}. Each effect of a catalogue was added to the model, fitted to a part of \
+             the records, and kept if it predicts the rest better than chance allows."
+        );
         output::write(
             path,
             &cellpos_reconcile::report(result, &title)
-                .lead(&crate::output::command_line())
+                .lead(&lead)
+                .command(&crate::output::command_line())
                 .to_html(),
         )?;
     }

@@ -31,7 +31,7 @@ use recorded::Recorded;
 use session::{Session, ending, events, provenance, timing};
 use std::path::{Path, PathBuf};
 use ticks::Ticks;
-use traces::{spectrum, traces};
+use traces::{over_the_run, spectrum, traces};
 
 /// Arguments of `cellpos report`.
 #[derive(Debug, clap::Args)]
@@ -69,26 +69,48 @@ fn single(run: &Path, args: &Args) -> CommandResult {
     let (meta, name) = (recorded.first.meta().ok(), recorded.name());
     let mut page = Report::new(&format!("Run {name}"));
     if let Some(meta) = meta {
-        page.lead(&origin::lead(meta));
+        page.lead(&origin::lead(meta, &cycles.rows));
     }
     let bound = bound::Bound::of(meta, ticks);
-    let sentence = result::section(&mut page, sessions, ticks, &cycles.rows, bound.as_ref());
+    let motions = learning::load(run);
+    let gain = match motions.as_slice() {
+        [one] => one.table.error_before_um.zip(one.table.error_after_um),
+        _ => None,
+    };
+    let sentence = result::section(
+        &mut page,
+        sessions,
+        ticks,
+        &cycles.rows,
+        bound.as_ref(),
+        gain,
+    );
     let of_a_cell = fatigue::figure(&cycles.rows).filter(|_| ticks.has_length);
     let is_cell = of_a_cell.is_some();
-    page.figure(of_a_cell.unwrap_or_else(|| result::error_figure(ticks, bound.as_ref())));
+    let has_error = ticks.rms_um().is_some();
+    page.figure(match of_a_cell {
+        Some(figure) => figure,
+        None if has_error => result::error_figure(ticks, bound.as_ref(), !cycles.rows.is_empty()),
+        // A run without an error still shows what happened.
+        None => over_the_run(ticks),
+    });
     if is_cell && let Some(montage) = montage::figure(sessions, &cycles.rows) {
         page.figure(montage);
     }
     head(&mut page, sessions, ticks);
-    traces(&mut page, ticks);
-    if is_cell {
+    traces(&mut page, ticks, is_cell || has_error);
+    if is_cell && has_error {
         page.section("Error");
-        page.figure(result::error_figure(ticks, bound.as_ref()));
+        page.figure(result::error_figure(
+            ticks,
+            bound.as_ref(),
+            !cycles.rows.is_empty(),
+        ));
     }
     spectrum(&mut page, ticks, meta);
     let trends = cycles::section(&mut page, cycles, is_cell);
     fatigue::section(&mut page, &cycles.rows, ticks);
-    learned(&mut page, run)?;
+    learned(&mut page, &motions);
     timing(&mut page, ticks);
     fault::section(&mut page, sessions)?;
     clips::section(&mut page, sessions);
@@ -221,10 +243,9 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
     }
 }
 
-fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
-    let motions = learning::load(run);
+fn learned(page: &mut Report, motions: &[learning::NamedTable]) {
     if motions.is_empty() {
-        return Ok(());
+        return;
     }
     page.section("Learning");
     let mut table = Table::new([
@@ -235,7 +256,7 @@ fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
         Column::right("retreats"),
         Column::left("the plant was taken to be known to"),
     ]);
-    for motion in &motions {
+    for motion in motions {
         let learned = &motion.table;
         table.row([
             motion.name.as_str(),
@@ -253,5 +274,4 @@ fn learned(page: &mut Report, run: &Path) -> Result<(), Failure> {
          tell an error to some 20 %.",
     );
     page.table(table);
-    Ok(())
 }

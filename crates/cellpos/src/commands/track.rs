@@ -23,6 +23,7 @@ use cellpos_session::recording::Recording;
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, View, Viewed};
+use cellpos_session::words::of_what_is_followed;
 use cellpos_session::{EndKind, Ended, Finished, Options, Rig, connect};
 use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
@@ -378,7 +379,10 @@ fn conclude(
     if args.json {
         print_json(&report)?;
     } else {
-        print_text(&text(&report))?;
+        print_text(&of_what_is_followed(
+            &text(&report),
+            rig.file().follows_a_cell(),
+        ))?;
     }
     Ok(if healthy && whole {
         Outcome::Done

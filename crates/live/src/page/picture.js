@@ -161,9 +161,10 @@ export class PictureView {
     inset.dataset.times = number(times * ratio / scale, 10);
     outlined(context, `×${inset.dataset.times}`, wide - 6, 5);
     if (picture.umPerPx) {
-      const um = 1, long = um / Math.abs(picture.umPerPx) * times;
-      context.fillStyle = isRed() ? "#ff8a78" : "#fff";
-      if (long < wide / 2) { context.fillRect(8, tall - 12, long, 4); context.textAlign = "left"; context.textBaseline = "bottom"; outlined(context, `${um} µm`, 8, tall - 14); }
+      const pxPerUm = times / Math.abs(picture.umPerPx), um = roundLength(wide / 2 / pxPerUm);
+      context.fillStyle = "#000"; context.fillRect(7, tall - 13, um * pxPerUm + 2, 6);
+      context.fillStyle = isRed() ? "#ff8a78" : "#fff"; context.fillRect(8, tall - 12, um * pxPerUm, 4);
+      context.textAlign = "left"; context.textBaseline = "bottom"; outlined(context, `${um} µm`, 8, tall - 14);
     }
   }
 }
@@ -173,12 +174,17 @@ function outlined(context, text, x, y) {
   context.strokeText(text, x, y); context.fillText(text, x, y);
 }
 
+// The longest of 1, 2, 5, 10, ... µm that is not longer than `most`.
+function roundLength(most) {
+  const power = 10 ** Math.floor(Math.log10(most));
+  return +([1, 2, 5].map(n => n * power).filter(n => n <= most).pop() ?? power).toPrecision(1);
+}
+
 // A scale bar of a round length, about a fifth of the picture.
 function scaleBar(context, { width, height, upright, umPerPx }, scale, ratio, canvas) {
   const span = Math.abs(umPerPx) * (upright ? height : width);
   if (!(span > 0)) return; // nothing is calibrated
-  const power = 10 ** Math.floor(Math.log10(span / 5));
-  const bar = [1, 2, 5, 10].map(n => n * power).filter(n => n <= span / 4).pop() ?? power;
+  const bar = roundLength(span / 4);
   const length = bar / Math.abs(umPerPx) * scale, x = 10 * ratio, y = canvas.height - x, thick = Math.max(3, 4 * ratio);
   context.fillStyle = isRed() ? "#ff8a78" : "#fff";
   context.font = `${Math.round(14 * ratio)}px system-ui, sans-serif`; context.textAlign = "left"; context.textBaseline = "bottom";

@@ -1,25 +1,44 @@
 //! The answer of a report: what the model lacks, and how far the gap falls with it.
 
-use super::{interval, small};
-use crate::verdict::result::{Effect, Reconciliation, Verdict};
+use super::{digits, small};
+use crate::verdict::result::{Effect, Interval, Reconciliation, Verdict};
 use cellpos_report::{Emphasis, Report};
 
-/// An effect with its first numbers in one clause: "time-delay at the camera (95 %: delay_s = 0.0020 [0.0019, 0.0021] s)".
+/// A parameter with its unit and interval: "delay = 2.0 ms (95 %: 1.9 to 2.1)".
+fn number(name: &str, found: &Interval) -> String {
+    // The unit is behind the number, not in the name.
+    let suffix = match found.unit.as_str() {
+        "s" => "_s",
+        "um" => "_um",
+        "um/s" => "_um_per_s",
+        "rad/s" => "_rad_per_s",
+        "1/s" => "_per_s",
+        "1/um" => "_per_um",
+        _ => "",
+    };
+    let name = name.strip_suffix(suffix).unwrap_or(name).replace('_', " ");
+    let (factor, unit) = match found.unit.as_str() {
+        "s" if found.value.abs() < 0.1 => (1e3, "ms"),
+        unit => (1.0, unit),
+    };
+    let [value, low, high] = digits(factor * found.value, found.ci95.map(|end| factor * end));
+    let unit = if unit.is_empty() {
+        String::new()
+    } else {
+        format!(" {unit}")
+    };
+    format!("{name} = {value}{unit} (95 %: {low} to {high})")
+}
+
+/// An effect with its first numbers in one clause: "time-delay at the camera, delay = 2.0 ms (95 %: 1.9 to 2.1)".
 fn clause(e: &Effect) -> String {
-    let numbers: Vec<String> = (e.parameters.iter())
-        .map(|(name, v)| {
-            let number = format!("{name} = {} {}", interval(v.value, v.ci95), v.unit);
-            number.trim_end().to_owned()
-        })
+    let numbers: String = (e.parameters.iter())
         .take(2)
+        .map(|(name, found)| format!(", {}", number(name, found)))
         .collect();
     let or = match e.alternatives.is_empty() {
         true => String::new(),
         false => format!(", or {}", e.alternatives.join(" or ")),
-    };
-    let numbers = match numbers.is_empty() {
-        true => String::new(),
-        false => format!(" (95 %: {})", numbers.join(", ")),
     };
     format!("{} at the {}{numbers}{or}", e.id, e.place)
 }

@@ -207,7 +207,13 @@ fn p_value(p: f64) -> String {
 }
 
 /// A value with its 95 % interval, to the digits that the interval leaves it.
-fn interval(value: f64, [low, high]: [f64; 2]) -> String {
+fn interval(value: f64, ci95: [f64; 2]) -> String {
+    let [value, low, high] = digits(value, ci95);
+    format!("{value} [{low}, {high}]")
+}
+
+/// A value and the ends of its interval, to the digits that the interval leaves them.
+fn digits(value: f64, [low, high]: [f64; 2]) -> [String; 3] {
     let width = (high - low).abs();
     // Two digits of the width; a value without a width, to six digits.
     let smallest = if width > 0.0 && width.is_finite() {
@@ -216,7 +222,7 @@ fn interval(value: f64, [low, high]: [f64; 2]) -> String {
         1e-5 * value.abs().max(f64::MIN_POSITIVE)
     };
     let digits = (-smallest.log10().floor()).clamp(0.0, 12.0) as usize;
-    format!("{value:.digits$} [{low:.digits$}, {high:.digits$}]")
+    [value, low, high].map(|value| format!("{value:.digits$}"))
 }
 
 /// Gain and phase with their 95 % intervals: low, middle, high; NaN in a band that was not excited.

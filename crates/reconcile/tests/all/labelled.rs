@@ -70,7 +70,7 @@ fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
     let page = report(&result, "labelled").to_html();
     let text = page.split("<body").nth(1).unwrap();
     let order = [
-        "The model lacks time-delay at the camera (95 %: delay_s = 0.00",
+        "The model lacks time-delay at the camera, delay = ",
         "With that the prediction error on held-out records falls from",
         "Prediction error of all records as the search went on",
         "The effects in numbers",

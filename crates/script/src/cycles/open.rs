@@ -9,6 +9,9 @@ use crate::plan::{Cycle, Plan};
 use cellpos_control::{Reference, SolverStatus};
 use cellpos_runtime::{Request, Stage, TickFlags, TickRecord};
 
+/// Half of the motion from peak to peak below which the reference rests, um.
+const STILL_UM: f64 = 0.01;
+
 /// Sums over the ticks of a cycle so far.
 #[derive(Debug)]
 pub(super) struct Open {
@@ -248,7 +251,10 @@ impl Open {
         row.length_peak_um = length_um.peak;
         row.length_end_um = length_um.end;
         // Of the length: the area follows it, but with a power below one, so that its relaxation is no single exponential.
-        row.recovery_s = self.lengths_um.recovery_s();
+        // A cell that rests under its load does not recover, whatever its noise looks like.
+        if row.stroke_um > STILL_UM {
+            row.recovery_s = self.lengths_um.recovery_s();
+        }
         let area_um2 = self.areas_um2.at_phases();
         row.area_start_um2 = area_um2.start;
         row.area_quarter_um2 = area_um2.quarter;

@@ -146,6 +146,16 @@ fn verdict_and_names(circle: &Circle) -> String {
     format!("{}: {}", verdict.word(), names.join(" + "))
 }
 
+/// What the models of the stages are called.
+fn model_of(stage: &Stage) -> String {
+    match stage.name {
+        "as given" => "the given model".to_owned(),
+        "as identified" => "the identified model".to_owned(),
+        "as reconciled" => "the corrected model".to_owned(),
+        other => other.to_owned(),
+    }
+}
+
 /// The added effects, with all delays together, and their benefit.
 fn sentence(circle: &Circle) -> String {
     let mut text = format!("{}.", verdict_and_names(circle));
@@ -153,26 +163,30 @@ fn sentence(circle: &Circle) -> String {
         text = format!("{}{}", first.to_uppercase(), &text[1..]);
     }
     let identified_ms = circle.identified.result.judged.model.delay_s * 1e3;
-    let added_ms: f64 = (circle.reconciled.effects.iter())
-        .flat_map(|effect| &effect.parameters)
-        .filter(|(_, p)| p.unit == "ms")
-        .map(|(_, p)| p.value)
-        .sum();
-    if added_ms != 0.0 {
+    let added = (circle.reconciled.effects.iter())
+        .filter(|effect| effect.id == "time-delay")
+        .find_map(|effect| effect.parameters.get("delay_s"));
+    if let Some(added) = added {
+        let [value, low, high] = [added.value, added.ci95[0], added.ci95[1]].map(|s| s * 1e3);
         text.push_str(&format!(
-            " Delays that belong together: {identified_ms:.2} ms identified in the loop, {added_ms:.2} ms in the effects that were added to a \
-             model without it."
+            " Delays that belong together: {identified_ms:.2} ms identified in the loop, {value:.2} ms (95 %: {low:.2} to {high:.2}) added to \
+             a model without it."
         ));
     }
     if let [first, .., last] = circle.stages.as_slice() {
+        let of = |stage: &Stage| {
+            format!(
+                "{} on the sine, {} holding",
+                rms(stage.sine.as_ref()),
+                rms(stage.hold.as_ref())
+            )
+        };
         text.push_str(&format!(
-            " Sine: {} with the controller for the {} model, {} with that for the {} model; hold: {} and {}.",
-            rms(first.sine.as_ref()),
-            first.name,
-            rms(last.sine.as_ref()),
-            last.name,
-            rms(first.hold.as_ref()),
-            rms(last.hold.as_ref())
+            " RMS errors (one run each): {} with the controller of {}; {} with that of {}.",
+            of(first),
+            model_of(first),
+            of(last),
+            model_of(last)
         ));
     }
     text
@@ -186,7 +200,18 @@ pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
         cellpos_reconcile::Verdict::Ambiguous => Emphasis::Warning,
         _ => Emphasis::Good,
     };
-    r.lead(&command_line());
+    let m = circle.motion;
+    r.lead(&format!(
+        "Task: measure the plant of {}, name what the model lacks, design the controller again on the corrected model, and compare. With \
+         each controller the bead was held for {} s, and moved on a sine of {} um to each side at {} Hz.",
+        match circle.truth {
+            Some(_) => "the emulated rig (a simulation)",
+            None => "the rig",
+        },
+        m.duration_s,
+        m.amplitude_um,
+        m.frequency_hz
+    ));
     r.result(status, &sentence(circle));
     r.figure(traces(circle));
 
@@ -206,6 +231,7 @@ pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     reconciled(&mut r, circle, gap);
     margins(&mut r, circle);
     tracking(&mut r, circle);
+    r.command(&command_line());
     r
 }
 

@@ -1,6 +1,7 @@
 //! The page of a design: whether it holds, by how much, and what error it leads one to expect.
 
 use crate::output::command_line;
+use cellpos_control::ControllerConfig;
 use cellpos_control::design::{
     DesignReport, DesignRequest, loop_response, predicted_density_um, step_response,
 };
@@ -20,10 +21,21 @@ pub(super) fn page(
     report: &DesignReport,
 ) -> Result<Report, PlantError> {
     let mut page = Report::new(&format!("Controller for {model}"));
-    page.lead(&command_line());
+    let law = match &report.controller {
+        ControllerConfig::Pi(pi) if pi.lead.is_some() => "PI with lead",
+        ControllerConfig::Pi(_) => "PI",
+        ControllerConfig::Lqg(_) => "LQG",
+        ControllerConfig::Mpc(..) => "MPC",
+    };
+    page.lead(&format!(
+        "Task: design a controller ({law}) that holds a bead on the plant {model}, with {:.2} ms from the exposure of a frame to the middle \
+         of the command that follows from it. All figures are calculated from the model; nothing was measured.",
+        request.plant.loop_delay_s() * 1e3
+    ));
     let (status, sentence) = sentence(request, report);
     page.result(status, &sentence);
     let Some(law) = report.law(&request.plant) else {
+        page.command(&command_line());
         return Ok(page);
     };
     let end_hz = 0.5 / request.plant.sample_time_s;
@@ -68,6 +80,7 @@ pub(super) fn page(
     for warning in &report.warnings {
         page.note(Emphasis::Warning, &warning.to_string());
     }
+    page.command(&command_line());
     Ok(page)
 }
 
@@ -82,7 +95,7 @@ fn sentence(request: &DesignRequest, report: &DesignReport) -> (Emphasis, String
     }
     let error = report.noise.as_ref().map_or_else(String::new, |noise| {
         format!(
-            " It holds within {:.0} nm RMS where {:.0} nm are possible.",
+            " Predicted error of a hold: {:.0} nm RMS; the lowest possible is {:.0} nm.",
             noise.rms_um * 1e3,
             report.bound_rms_um * 1e3
         )
@@ -112,7 +125,7 @@ fn sentence(request: &DesignRequest, report: &DesignReport) -> (Emphasis, String
         (true, _) => Emphasis::Warning,
     };
     let text = format!(
-        "With a loop delay of {delay_ms:.2} ms the loop is stable: phase margin {:.0} deg, gain margin {:.1} dB, delay margin {:.2} ms.\
+        "The loop is stable: phase margin {:.0} deg, gain margin {:.1} dB, delay margin {:.2} ms.\
          {error}{spread}{limits}",
         m.pm_deg,
         m.gm_db,

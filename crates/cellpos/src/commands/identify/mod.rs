@@ -96,7 +96,7 @@ pub(crate) struct Args {
     #[arg(long, default_value = "eq6", help_heading = ON_A_RIG)]
     model: String,
     /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
-    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", help_heading = ON_A_RIG)]
     ideal: Option<bool>,
     /// Seed of the emulated rig, the excitation and the bootstrap [default: that of rig.toml, else 1].
     #[arg(long, help_heading = ON_A_RIG)]
@@ -381,6 +381,10 @@ pub(crate) fn run(args: Args) -> CommandResult {
         place(&args.out, "model.toml"),
         place(&args.report, "report.html"),
     );
+    let rig = match &args.rig {
+        Some(path) => path.display().to_string(),
+        None => format!("emulated, model {}, seed {}", args.model, job.seed),
+    };
     let provenance = BTreeMap::from([
         ("command".to_owned(), command_line()),
         (
@@ -395,13 +399,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
                 .collect::<Vec<_>>()
                 .join(" "),
         ),
-        (
-            "rig".to_owned(),
-            match &args.rig {
-                Some(path) => path.display().to_string(),
-                None => format!("emulated, model {}, seed {}", args.model, job.seed),
-            },
-        ),
+        ("rig".to_owned(), rig.clone()),
     ]);
     let model = Model {
         frame_age_s: Some(done.age_s),
@@ -411,7 +409,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
             .map_err(Failure::failed)?
     };
     output::write(&model_path, &model.to_toml_string())?;
-    report::report(&done, &command_line(), args.eq6)
+    report::report(&done, &rig, &command_line(), args.eq6)
         .write_with_figures(&report_path)
         .map_err(Failure::failed)?;
     if args.json {

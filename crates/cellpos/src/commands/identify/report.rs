@@ -4,6 +4,7 @@ use super::tables::interval;
 pub(crate) use super::tables::{candidates, lines, number, parameters};
 use cellpos_experiment::identify::Done;
 use cellpos_ident::candidate_model::CandidateModel;
+use cellpos_ident::frequency_response::FrequencyPoint;
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
 use cellpos_plant::{EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
@@ -319,12 +320,12 @@ fn sentence(done: &Done) -> (Emphasis, String) {
         } else {
             format!(" {}", p.unit)
         };
-        format!(
-            "{} {}{unit} (95 %: {})",
-            p.meaning,
-            number(p.value),
-            interval(p.ci95)
-        )
+        let name = match p.meaning.split_once(": ") {
+            Some((name, what)) => format!("{name} ({what})"),
+            None => p.meaning.to_string(),
+        };
+        let interval = interval(p.ci95).replace(" .. ", " to ");
+        format!("{name} = {}{unit} (95 %: {interval})", number(p.value))
     };
     // Gain and delay limit a loop; the other parameters are in the table.
     let delay = known.iter().skip(1).rfind(|p| p.meaning.contains("delay"));
@@ -344,7 +345,7 @@ fn sentence(done: &Done) -> (Emphasis, String) {
     if unknown > 0 && !known.is_empty() {
         let all = result.judged.parameters.len();
         text.push_str(&format!(
-            " {unknown} of the {all} parameters cannot be determined from these frequencies."
+            " These frequencies do not determine the other {unknown} of the {all} parameters."
         ));
     }
     let status = match (known.is_empty(), result.warnings.is_empty()) {
@@ -356,10 +357,21 @@ fn sentence(done: &Done) -> (Emphasis, String) {
 }
 
 /// The whole report.
-pub(crate) fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
+pub(crate) fn report(done: &Done, rig: &str, command_line: &str, eq6: bool) -> Report {
     let result = &done.result;
     let mut report = Report::new("Identification");
-    report.lead(command_line);
+    let points = &result.measured.points;
+    let hz = |end: Option<&FrequencyPoint>| end.map_or(f64::NAN, |point| point.frequency_hz);
+    let record_s: f64 = (done.plan.segments.iter())
+        .map(|segment| segment.settle_s + segment.measure_s)
+        .sum();
+    report.lead(&format!(
+        "Task: measure how the bead follows the piezo (PZT), and fit a model to it. The PZT was driven at {} frequencies from {} to {} Hz \
+         while a loop held the bead in view, {record_s:.0} s in all. Rig: {rig}.",
+        points.len(),
+        hz(points.first()),
+        hz(points.last()),
+    ));
     let (status, sentence) = sentence(done);
     report.result(status, &sentence);
     report.figure(bode(
@@ -415,5 +427,6 @@ pub(crate) fn report(done: &Done, command_line: &str, eq6: bool) -> Report {
         "{} rows of record.",
         done.records.iter().map(|r| r.input.len()).sum::<usize>()
     ));
+    report.command(command_line);
     report
 }

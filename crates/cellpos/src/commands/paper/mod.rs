@@ -7,7 +7,7 @@ mod figures;
 mod row;
 mod table;
 
-use super::identify::{command_line, new_run_folder};
+use super::identify::new_run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_emulator::WorldConfig;
 use cellpos_experiment::identify::held_bead::{HeldBead, Setup};
@@ -216,12 +216,11 @@ fn report(
         &done.result,
         (320.0, true),
     ));
-    report.lead(&format!(
-        "`{}`. Every number comes from rendered frames of the emulated rig with Eq. (6) as its plant, through localiser, loop \
-         and PZT board. The bead was held by PI while each line was driven, the amplitude shaped to keep it in view; Fig. A1 is \
-         an open-loop record.",
-        command_line()
-    ));
+    report.lead(
+        "Task: repeat the paper's measurements on the emulated rig (a simulation with Eq. (6) as its plant), and compare every number. Each \
+         number comes from rendered frames, through localiser, loop and PZT board; a PI loop held the bead while each line was driven; \
+         Fig. A1 is an open-loop record.",
+    );
     let mut table = Table::new([
         Column::left("quantity"),
         Column::right("paper"),

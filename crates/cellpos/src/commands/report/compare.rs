@@ -8,7 +8,7 @@ use super::session::folder_name;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
 use cellpos_report::{Emphasis, Report};
 use cellpos_script::ArmKind;
-use data::{ARMS, BEAD, CELL, Compared, Ends, Quantity, arm_name};
+use data::{ARMS, BEAD, CELL, Compared, Ends, Quantity};
 use shown::{errors, over_cycles, table_of_ends, table_of_runs};
 use std::path::{Path, PathBuf};
 
@@ -67,14 +67,7 @@ fn quantities(compared: &[Compared]) -> &'static [Quantity] {
 
 fn page(compared: &[Compared]) -> (Report, String) {
     let mut page = Report::new(&format!("{} runs compared", compared.len()));
-    // What all have in common, or the first and how many others there are.
-    if let Some((first, others)) = compared.split_first() {
-        let rest = others.len();
-        page.lead(&format!(
-            "{}: {} And {rest} more, see below.",
-            first.name, first.lead
-        ));
-    }
+    page.lead(&lead(compared));
     let quantities = quantities(compared);
     let mut parts: Vec<String> = ARMS
         .iter()
@@ -82,6 +75,8 @@ fn page(compared: &[Compared]) -> (Report, String) {
         .collect();
     if parts.is_empty() {
         parts.extend(of_holds(compared));
+    } else if compared.len() > 1 {
+        parts.push("Intervals: 95 %, between runs.".to_owned());
     }
     let done = compared
         .iter()
@@ -110,11 +105,30 @@ fn page(compared: &[Compared]) -> (Report, String) {
         page.figure(errors(compared));
     }
     page.section("What was run");
-    let said = compared
-        .iter()
-        .map(|run| format!("{}: {} {}", run.name, run.lead, run.run.display()));
+    let said = compared.iter().map(|run| {
+        let (name, task, started) = (&run.name, &run.task, &run.started);
+        format!("{name}: {task} {started}, {}", run.run.display())
+    });
     page.list(&said.collect::<Vec<_>>());
     (page, sentence)
+}
+
+/// What the runs had in common, or the task of each.
+fn lead(compared: &[Compared]) -> String {
+    let names: Vec<&str> = compared.iter().map(|run| run.name.as_str()).collect();
+    let names = names.join(", ");
+    match compared.split_first() {
+        Some((first, others)) if others.iter().all(|run| run.task == first.task) => {
+            format!("{} Done {} times: {names}.", first.task, compared.len())
+        }
+        _ => {
+            let tasks = compared.iter().map(|run| {
+                let task = run.task.strip_prefix("Task: ").unwrap_or(&run.task);
+                format!("{}: {task}", run.name)
+            });
+            tasks.collect::<Vec<_>>().join(" ")
+        }
+    }
 }
 
 /// What became of an arm: mean over the runs of the first and of the last cycles, and whether the change is beyond chance.
@@ -149,7 +163,7 @@ fn of_an_arm(compared: &[Compared], arm: ArmKind, quantities: &[Quantity]) -> Op
                 let (first, last) = (mean(&|ends| ends.first), mean(&|ends| ends.last));
                 let (change, ci95) = mean(&|ends| ends.last - ends.first);
                 let sure = match change.abs() > ci95 {
-                    true => format!("a change of {}", with_interval(change, ci95)),
+                    true => format!("change {}", with_interval(change, ci95)),
                     false => "no change beyond the scatter between runs".to_owned(),
                 };
                 format!(
@@ -164,12 +178,10 @@ fn of_an_arm(compared: &[Compared], arm: ArmKind, quantities: &[Quantity]) -> Op
     }
     let of = match (most, arm) {
         (0, _) => return None,
-        (1, ArmKind::Cyclic) => "One run, cyclic".to_owned(),
-        (1, ArmKind::Static) => "One run, static".to_owned(),
-        (n, arm) => format!(
-            "{n} runs, {}, mean with 95 % interval between runs",
-            arm_name(arm)
-        ),
+        (1, ArmKind::Cyclic) => "Cyclic arm of one run".to_owned(),
+        (1, ArmKind::Static) => "Static arm of one run".to_owned(),
+        (n, ArmKind::Cyclic) => format!("Cyclic arm, mean of {n} runs"),
+        (n, ArmKind::Static) => format!("Static arm, mean of {n} runs"),
     };
     Some(format!("{of}: {}.", said.join(", ")))
 }
@@ -195,7 +207,7 @@ fn of_holds(compared: &[Compared]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::data::values;
+    use super::data::{arm_name, values};
     use super::*;
     use cellpos_script::{CycleRow, trend};
 
@@ -232,7 +244,8 @@ mod tests {
                 last_ci95: found.last.ci95,
             }],
             emphasis: Emphasis::Good,
-            lead: String::new(),
+            task: String::new(),
+            started: String::new(),
             rows,
         }
     }
@@ -248,10 +261,10 @@ mod tests {
             run("e", ArmKind::Static, -0.001),
         ];
         let cyclic = of_an_arm(&study, ArmKind::Cyclic, &CELL).unwrap();
-        assert!(cyclic.starts_with("3 runs, cyclic"), "{cyclic}");
+        assert!(cyclic.starts_with("Cyclic arm, mean of 3 runs"), "{cyclic}");
         // Thirty cycles lie between the middles of the first and the last ten.
         assert!(
-            cyclic.contains("a change of -0.300\u{a0}±\u{a0}0.075"),
+            cyclic.contains("change -0.300\u{a0}±\u{a0}0.075"),
             "{cyclic}"
         );
         let fixed = of_an_arm(&study, ArmKind::Static, &CELL).unwrap();

@@ -300,7 +300,7 @@ fn groups(rows: &[CycleRow]) -> Vec<Group<'_>> {
 }
 
 /// A number to three digits, without zeros behind it.
-fn short(value: f64) -> String {
+pub(super) fn short(value: f64) -> String {
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_string()
 }

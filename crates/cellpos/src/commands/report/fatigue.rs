@@ -167,7 +167,7 @@ pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
     ];
     for (name, unit, value) in quantities {
         let mut panel =
-            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(200.0);
+            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(150.0);
         for (color, arm, label) in [
             (0, ArmKind::Cyclic, "cyclic"),
             (1, ArmKind::Static, "static"),

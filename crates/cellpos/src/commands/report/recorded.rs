@@ -2,7 +2,7 @@
 
 use super::session::Session;
 use super::ticks::Ticks;
-use super::{bound, fatigue};
+use super::{bound, fatigue, origin};
 use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::{CYCLES_CSV, RunReader};
@@ -40,6 +40,7 @@ impl Recorded {
             sessions.push(Session {
                 lost: batches.lost(),
                 events: reader.events().map_err(Failure::failed)?.events,
+                of_a_cell: reader.meta().is_ok_and(origin::is_cell),
                 meta: reader.meta().ok().cloned(),
                 folder,
                 start_s,

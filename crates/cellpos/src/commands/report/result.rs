@@ -2,7 +2,9 @@
 
 use super::Session;
 use super::bound::Bound;
+use super::origin;
 use super::ticks::Ticks;
+use super::traces;
 use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleRow, Trend, trend};
 use cellpos_session::connect::ENDED;
@@ -14,26 +16,35 @@ pub(super) fn section(
     ticks: &Ticks,
     rows: &[CycleRow],
     bound: Option<&Bound>,
+    learned: Option<(f64, f64)>,
 ) -> String {
     let (status, ended) = ending(sessions);
+    let what = origin::subject(sessions.iter().find_map(|session| session.meta.as_ref()));
     let (lost, without) = (
         counted(sessions, "frames_lost"),
         counted(sessions, "fixes_lost"),
     );
     let mut sentence = of_a_cell(rows)
-        .or_else(|| of_waves(rows))
-        .or_else(|| of_cycles(rows))
-        .or_else(|| of_a_hold(ticks, bound))
+        .or_else(|| of_waves(rows, what))
+        .or_else(|| of_cycles(rows, what))
+        .or_else(|| of_a_hold(ticks, bound, what, ended.is_none()))
         .unwrap_or_else(|| {
             "The loop was not closed long enough for an error to be stated.".to_string()
         });
+    if let Some((before_um, after_um)) = learned {
+        sentence.push_str(&format!(
+            " Learning took it from {} nm in the first cycles to {} nm in the last.",
+            nm(before_um),
+            nm(after_um)
+        ));
+    }
     sentence.push_str(&match lost {
         0 => " No frame was lost.".to_string(),
         1 => " One frame was lost.".to_string(),
         many => format!(" {many} frames were lost."),
     });
     if without > 0 {
-        sentence.push_str(&format!(" {without} frames showed no bead."));
+        sentence.push_str(&format!(" {without} frames showed no {what}."));
     }
     if let Some(ended) = ended {
         sentence.push_str(&format!(" The run did not end as planned: {ended}."));
@@ -92,14 +103,16 @@ fn change(found: &Trend) -> String {
 /// A cell over its cycles.
 fn of_a_cell(rows: &[CycleRow]) -> Option<String> {
     let rest = AtRest::of(rows);
-    let stretch = cyclic(rows, |row| rest.stretch(row))?;
+    let Some(stretch) = cyclic(rows, |row| rest.stretch(row)) else {
+        return of_few_cycles(rows, &rest);
+    };
     let mut text = format!(
-        "Stretch went {} over {} cycles",
+        "The cell's stretch (largest length over that at rest) went {} over {} cycles",
         change(&stretch),
         stretch.cycles
     );
     if let Some(recovery) = cyclic(rows, |row| row.recovery_s) {
-        text.push_str(&format!(", recovery time {} s", change(&recovery)));
+        text.push_str(&format!(", its recovery time {} s", change(&recovery)));
     }
     text.push_str(&format!(
         " (means of the first and the last {}, with 95 % intervals).",
@@ -108,21 +121,38 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<String> {
     Some(text)
 }
 
+/// A cell over too few cycles for an interval.
+fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<String> {
+    let stretches: Vec<f64> = (rows.iter())
+        .filter(super::fatigue::is_whole)
+        .filter(|row| !super::cycles::was_elsewhere(row))
+        .map(|row| rest.stretch(row))
+        .filter(|stretch| stretch.is_finite())
+        .collect();
+    let (first, last) = (stretches.first()?, stretches.last()?);
+    Some(format!(
+        "The cell's stretch (largest length over that at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles: too few \
+         for an interval.",
+        stretches.len()
+    ))
+}
+
 /// A bead over cycles of waves, each with an amplitude of its own.
-fn of_waves(rows: &[CycleRow]) -> Option<String> {
+fn of_waves(rows: &[CycleRow], what: &str) -> Option<String> {
     let reached = cyclic(rows, |row| row.reached_um / row.commanded_um)?;
     let rms = nm(CycleRow::rms_over_um(rows)?);
     Some(format!(
-        "{} cycles: {} of the commanded amplitude in the first {}, {} in the last; error {rms} nm RMS over the cycles.",
-        reached.cycles,
+        "The {what} reached {} of the commanded amplitude in the first {} of {} cycles, and {} in the last (means with 95 % intervals). \
+         Error: {rms} nm RMS over the cycles.",
         super::with_interval(reached.first.mean, reached.first.ci95),
         reached.first.cycles,
+        reached.cycles,
         super::with_interval(reached.last.mean, reached.last.ci95),
     ))
 }
 
 /// A bead over the cycles of a script. Its steps count, which the error of a hold leaves out.
-fn of_cycles(rows: &[CycleRow]) -> Option<String> {
+fn of_cycles(rows: &[CycleRow], what: &str) -> Option<String> {
     let rms = nm(CycleRow::rms_over_um(rows)?);
     let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
     let but = match disturbed {
@@ -131,26 +161,37 @@ fn of_cycles(rows: &[CycleRow]) -> Option<String> {
     };
     let cycles = if rows.len() == 1 { "cycle" } else { "cycles" };
     Some(format!(
-        "{} {cycles}{but}: error {rms} nm RMS over the cycles, steps included.",
+        "The {what} went through {} {cycles}{but}, with an error of {rms} nm RMS over the cycles, steps included.",
         rows.len()
     ))
 }
 
 /// A bead that was held, or moved.
-fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>) -> Option<String> {
+fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>, what: &str, kept: bool) -> Option<String> {
     let rms_um = ticks.rms_um()?;
-    let ci95 = ticks
-        .rms_ci95_um()
-        .map_or_else(String::new, |um| format!("\u{a0}±\u{a0}{}", nm(um)));
-    let long = duration(ticks.duration_s());
-    let error = format!("{}{ci95} nm RMS", nm(rms_um));
-    Some(match (ticks.target_moves, bound) {
-        (true, _) => format!("Followed a moving target with an error of {error}, for {long}."),
-        (false, Some(bound)) => format!(
-            "Held within {error} where {} nm are possible, for {long}.",
-            nm(bound.rms_um)
+    let error = match ticks.rms_ci95_um() {
+        Some(ci95_um) => format!(
+            "{} nm RMS (95 % interval)",
+            super::with_interval(1e3 * rms_um, 1e3 * ci95_um)
         ),
-        (false, None) => format!("Held within {error}, for {long}."),
+        None => format!("{} nm RMS", nm(rms_um)),
+    };
+    let long = duration(ticks.duration_s());
+    let possible = bound.map_or_else(String::new, |bound| {
+        format!("; the lowest possible is {:.1} nm", bound.rms_um * 1e3)
+    });
+    Some(match ticks.motion_rms_um() {
+        Some(motion_um) if rms_um < motion_um => format!(
+            "The {what} followed its moving target for {long} with an error of {error}, {:.1} % of the motion.",
+            1e2 * rms_um / motion_um
+        ),
+        Some(_) => format!("The {what} did not follow its moving target: error {error} in {long}."),
+        None if kept => {
+            format!(
+                "The {what} stayed at its target for {long} with an error of {error}{possible}."
+            )
+        }
+        None => format!("The {what} was to stay at its target: error {error} in {long}{possible}."),
     })
 }
 
@@ -172,11 +213,11 @@ fn duration(s: f64) -> String {
     }
 }
 
-/// The error over the run and how it is spread.
-pub(super) fn error_figure(ticks: &Ticks, bound: Option<&Bound>) -> Figure {
+/// The error over the run; beside it how it is spread, or the motion.
+pub(super) fn error_figure(ticks: &Ticks, bound: Option<&Bound>, of_a_script: bool) -> Figure {
     let course = ticks.error.course(0);
     let mut over_time = Panel::new(Axis::linear("time", "s"), Axis::linear("error", "nm"));
-    let mut caption = "Error of the measured position, target at the exposure taken off, while the loop was closed".to_string();
+    let mut caption = "Error: measured position less the target at the time of its exposure, from two seconds after the loop was closed".to_string();
     if ticks.error.is_bare() {
         over_time = over_time.series(Series::line("error", &course.time_s, &course.median).thin());
     } else {
@@ -195,14 +236,39 @@ pub(super) fn error_figure(ticks: &Ticks, bound: Option<&Bound>) -> Figure {
                     .color(0)
                     .thin(),
             );
-        caption.push_str(", as an envelope with its median");
+        caption.push_str(" (envelope and median)");
     }
-    if let (Some(bound), false) = (bound, ticks.target_moves) {
+    if ticks.motion_rms_um().is_some() {
+        let motion = if of_a_script {
+            caption.push_str(". Left: position and target over the whole run.");
+            traces::position(ticks)
+        } else {
+            let end = ticks.last_periods(3.0);
+            caption.push_str(
+                ". Left: measured position at the end of the run, and the target at the time of each exposure.",
+            );
+            Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"))
+                .series(Series::line("target", &end.time_s, &end.target_um).color(1))
+                .series(
+                    Series::points("measured", &end.time_s, &end.measured_um)
+                        .color(0)
+                        .thin(),
+                )
+        };
+        return Figure::new("error", &caption)
+            .panel(motion)
+            .panel(over_time)
+            .columns(2);
+    }
+    if let Some(bound) = bound {
+        let [low, high] = [-1e3, 1e3].map(|sign| [sign * bound.rms_um; 2]);
+        let ends = [0.0, ticks.end_s()];
+        let line = |name: &str, at: &[f64; 2]| Series::line(name, &ends, at).dashed().color(1);
         over_time = over_time
-            .horizontal(bound.rms_um * 1e3, "lowest possible RMS")
-            .horizontal(-bound.rms_um * 1e3, "");
+            .series(line("lowest possible RMS", &high))
+            .series(line("", &low));
         caption.push_str(&format!(
-            "; dotted: the lowest RMS that Brownian motion ({} um2/s), delay and localisation noise allow, {:.1} nm",
+            "; dashed: the lowest RMS that Brownian motion ({} um2/s), delay and localisation noise allow, {:.1} nm",
             bound.diffusion_um2_per_s,
             bound.rms_um * 1e3
         ));

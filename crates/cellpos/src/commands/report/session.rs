@@ -3,6 +3,7 @@
 use super::ticks::Ticks;
 use cellpos_record::{Lost, RunMeta};
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Table};
+use cellpos_session::words::of_what_is_followed;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -10,6 +11,8 @@ use std::path::{Path, PathBuf};
 pub(super) struct Session {
     pub(super) folder: PathBuf,
     pub(super) meta: Option<RunMeta>,
+    /// Whether a cell was followed, not a bead.
+    pub(super) of_a_cell: bool,
     pub(super) lost: Lost,
     pub(super) events: Vec<cellpos_record::Event>,
     /// Start since the start of the run, s.
@@ -78,6 +81,11 @@ pub(super) fn events(page: &mut Report, sessions: &[Session]) {
             let data = match event.data.get("text").and_then(|text| text.as_str()) {
                 Some(text) => text.to_owned(),
                 None => serde_json::to_string(&event.data).unwrap_or_default(),
+            };
+            let data = match event.event.as_str() {
+                // What a person wrote stays as it was written.
+                "note" | "mark" => data,
+                _ => of_what_is_followed(&data, session.of_a_cell),
             };
             let time = format!("{:.3}", session.start_s + event.time_s);
             table.row([time.as_str(), &event.event, &data]);

@@ -4,6 +4,10 @@ use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::{Decades, Spread};
 use cellpos_runtime::{Hold, Statistics, TickRecord};
+use std::collections::VecDeque;
+
+/// Rows that are kept of the end of a run.
+const LAST_ROWS: usize = 2000;
 
 /// A stretch of the run, tick by tick.
 #[derive(Debug, Default)]
@@ -42,6 +46,10 @@ pub(super) struct Ticks {
     /// Reference of the last tick, um, and the direction in which it last moved.
     moving: (f64, bool),
     pub excerpt: Excerpt,
+    /// The last seconds of the closed loop, in which its error counts.
+    last: VecDeque<[f64; 3]>,
+    /// Count, mean and sum of squares about it, of the target where the error counts, um.
+    motion: (f64, f64, f64),
     /// Errors of every tick whose error counts (see [`Statistics`]), nm.
     pub error_nm: Spread,
     /// The same over the run, nm; NaN if it does not count.
@@ -148,6 +156,18 @@ impl Ticks {
             return;
         }
         self.error.add(time_s, [r.error_um * 1e3]);
+        let (n, mean, _) = &mut self.motion;
+        *n += 1.0;
+        let off_um = r.target_um - *mean;
+        *mean += off_um / *n;
+        self.motion.2 += off_um * (r.target_um - self.motion.1);
+        if self.last.len() == LAST_ROWS {
+            self.last.pop_front();
+        }
+        // The target that the position is compared with is that of its exposure.
+        let exposed_s = self.start_s + r.mid_exposure_ns as f64 * 1e-9;
+        self.last
+            .push_back([exposed_s, r.measured_um - r.error_um, r.measured_um]);
         let first_um = *self.counted_target_um.get_or_insert(r.target_um);
         self.target_moves |= (r.target_um - first_um).abs() > 1e-9;
         self.error_nm.add(r.error_um * 1e3);
@@ -180,6 +200,29 @@ impl Ticks {
             (count, first, last) if count > 2 => 2.0 * (last - first) as f64 / (count - 1) as f64,
             _ => f64::INFINITY,
         }
+    }
+
+    /// RMS of the target about its mean while the error counted, um; none if it rests.
+    pub(super) fn motion_rms_um(&self) -> Option<f64> {
+        let (n, _, squares) = self.motion;
+        self.target_moves.then(|| (squares / n.max(1.0)).sqrt())
+    }
+
+    /// The last periods of a reference that goes to and fro; of any other the last second.
+    pub(super) fn last_periods(&self, periods: f64) -> Excerpt {
+        let second = (1.0 / self.period_s()).round();
+        let wanted = match self.period_rows() {
+            rows if rows.is_finite() => (periods * rows).ceil(),
+            _ => second,
+        };
+        let skipped = self.last.len().saturating_sub(wanted as usize);
+        let mut excerpt = Excerpt::default();
+        for [time_s, target_um, measured_um] in self.last.iter().skip(skipped) {
+            excerpt.time_s.push(*time_s);
+            excerpt.target_um.push(*target_um);
+            excerpt.measured_um.push(*measured_um);
+        }
+        excerpt
     }
 
     /// Start of the last tick, s since the start of the run.

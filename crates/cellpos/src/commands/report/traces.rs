@@ -25,36 +25,29 @@ fn partner(ticks: &Ticks) -> Panel {
     panel
 }
 
-pub(super) fn traces(page: &mut Report, ticks: &Ticks) {
-    page.section("Traces");
+/// Position and target over the whole run.
+pub(super) fn position(ticks: &Ticks) -> Panel {
+    // The target is thin and on top; one that moves fast has an upper and a lower end.
+    let target = ticks.traces.course_of(0, ticks.period_rows());
+    let panel = Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"));
+    let panel = enveloped(panel, ticks, 1, "measured", 0);
+    let end = |name: &str, um: &[f64]| Series::line(name, &target.time_s, um).thin().color(1);
+    let panel = panel.series(end("target", &target.low));
+    match ticks.traces.is_bare() {
+        true => panel,
+        false => panel.series(end("", &target.high)),
+    }
+}
+
+/// Position and target, PZT and zero flow over the whole run.
+pub(super) fn over_the_run(ticks: &Ticks) -> Figure {
     let time = || Axis::linear("time", "s");
-    let caption = match ticks.traces.is_bare() {
+    let mut caption = match ticks.traces.is_bare() {
         true => "Position and target (above), PZT and zero flow (below) over the whole run.".to_string(),
         false => "Position and target (above), PZT and zero flow (below) over the whole run: area from the smallest to the largest \
                   value of each stretch of time, line: median; the target by its two ends."
             .to_string(),
     };
-    // The target is thin and on top; one that moves fast has an upper and a lower end.
-    let target = ticks.traces.course_of(0, ticks.period_rows());
-    let mut bead = enveloped(
-        Panel::new(time(), Axis::linear("position", "um")),
-        ticks,
-        1,
-        "measured",
-        0,
-    )
-    .series(
-        Series::line("target", &target.time_s, &target.low)
-            .thin()
-            .color(1),
-    );
-    if !ticks.traces.is_bare() {
-        bead = bead.series(
-            Series::line("", &target.time_s, &target.high)
-                .thin()
-                .color(1),
-        );
-    }
     let pzt = enveloped(
         Panel::new(time(), Axis::linear("PZT", "um")),
         ticks,
@@ -68,16 +61,28 @@ pub(super) fn traces(page: &mut Report, ticks: &Ticks) {
             .thin()
             .color(3),
     );
-    let mut caption = caption;
-    let mut figure = Figure::new("traces", "").panel(bead).panel(pzt);
+    let mut figure = Figure::new("traces", "").panel(position(ticks)).panel(pzt);
     if ticks.has_partner {
         caption.push_str(
             " Below: displacement of the slow partner as it reports it, on its own scale, and what it does to the flow, in um of PZT.",
         );
         figure = figure.panel(partner(ticks));
     }
-    page.figure(figure.caption(&caption).share_x());
+    figure.caption(&caption).share_x()
+}
+
+/// Adds the traces; `whole`: also those over the whole run, which are not at the top of the page.
+pub(super) fn traces(page: &mut Report, ticks: &Ticks, whole: bool) {
+    page.section("Traces");
+    let time = || Axis::linear("time", "s");
+    if whole {
+        page.figure(over_the_run(ticks));
+    }
     let near = &ticks.excerpt;
+    if near.time_s.is_empty() {
+        page.paragraph("The loop was never closed.");
+        return;
+    }
     page.figure(
         Figure::new(
             "excerpt",

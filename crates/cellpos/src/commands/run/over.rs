@@ -9,6 +9,7 @@ use cellpos_script::{CycleRow, Plan};
 use cellpos_session::clips::Clipped;
 use cellpos_session::setup::Setup;
 use cellpos_session::view::{View, Viewed};
+use cellpos_session::words::of_what_is_followed;
 use cellpos_session::{EndKind, Ended, Finished, connect};
 use std::path::PathBuf;
 
@@ -116,7 +117,12 @@ pub(super) fn conclude(
     match (telling.tell, telling.json) {
         (false, _) => {}
         (true, true) => print_json(&report)?,
-        (true, false) => print_text(&report.text())?,
+        (true, false) => {
+            print_text(&of_what_is_followed(
+                &report.text(),
+                rig.file().follows_a_cell(),
+            ))?;
+        }
     }
     let whole = outcome == "done" && kept.whole && cycle_faults.rows_lost == 0;
     Ok(Over {

@@ -80,7 +80,9 @@ pub(super) struct Compared {
     #[serde(skip)]
     pub(super) emphasis: Emphasis,
     #[serde(skip)]
-    pub(super) lead: String,
+    pub(super) task: String,
+    #[serde(skip)]
+    pub(super) started: String,
     #[serde(skip)]
     pub(super) rows: Vec<CycleRow>,
 }
@@ -155,7 +157,8 @@ impl Compared {
                 .flatten(),
             ends,
             emphasis,
-            lead: meta.map_or_else(String::new, origin::lead),
+            task: meta.map_or_else(String::new, |meta| origin::task(meta, &rows)),
+            started: meta.map_or_else(String::new, |meta| meta.started_utc.clone()),
             rows,
         })
     }

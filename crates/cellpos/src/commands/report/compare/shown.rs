@@ -15,7 +15,7 @@ pub(super) fn over_cycles(compared: &[Compared], quantities: &[Quantity]) -> Fig
     );
     for quantity in quantities {
         let y = Axis::linear(quantity.name, quantity.unit);
-        let mut panel = Panel::new(Axis::linear("cycle", ""), y).height_px(190.0);
+        let mut panel = Panel::new(Axis::linear("cycle", ""), y).height_px(150.0);
         for (color, run) in compared.iter().enumerate() {
             for arm in ARMS {
                 let points = values(&run.rows, arm, quantity);

@@ -180,7 +180,11 @@ pub(super) fn sentence(done: usize, rows: &[CellRow], cycles: &[Vec<CycleRow>]) 
     );
     type Value = fn(&CycleRow, &AtRest) -> f64;
     let quantities: [(&str, &str, Value); 2] = [
-        ("Stretch", "", |row, rest| rest.stretch(row)),
+        (
+            "Stretch (largest length over that at rest)",
+            "",
+            |row, rest| rest.stretch(row),
+        ),
         ("recovery time", " s", |row, _| row.recovery_s),
     ];
     let mut parts = Vec::new();
@@ -213,6 +217,33 @@ pub(super) fn sentence(done: usize, rows: &[CellRow], cycles: &[Vec<CycleRow>]) 
     text
 }
 
+/// What was done.
+fn lead(rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> String {
+    let whole = |rows: &Vec<CycleRow>| counted(rows).count();
+    let (least, most) = (
+        cycles.iter().map(whole).min().unwrap_or(0),
+        cycles.iter().map(whole).max().unwrap_or(0),
+    );
+    let each = match least == most {
+        true => format!("{most} whole cycles each"),
+        false => format!("{least} to {most} whole cycles each"),
+    };
+    let of_one = (cycles.iter().flat_map(|rows| counted(rows)))
+        .find(|row| row.stroke_um.is_finite())
+        .map_or_else(String::new, |row| {
+            format!(
+                " of {:.1} um to and fro in {:.1} s",
+                2.0 * row.stroke_um,
+                row.duration_s
+            )
+        });
+    format!(
+        "Task: the same script for {} cells, one after the other; {each}{of_one}. The loop moves each cell to and fro by camera and piezo \
+         (PZT), and measures how far it stretches and how fast it recovers.",
+        rows.len()
+    )
+}
+
 /// The page: the figure of the population, and the table.
 pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Report {
     let mut page = Report::new(&format!("Cells: {name}"));
@@ -222,7 +253,7 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     } else {
         Emphasis::Warning
     };
-    page.lead(&command_line());
+    page.lead(&lead(rows, cycles));
     page.result(status, &sentence(done, rows, cycles));
     type Value = fn(&CycleRow, &AtRest) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
@@ -249,10 +280,11 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
         }
         any = true;
         let mut panel =
-            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(220.0);
-        for course in courses.iter().filter(|course| !course.is_empty()) {
+            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(150.0);
+        for (n, course) in (courses.iter().filter(|course| !course.is_empty())).enumerate() {
             let (x, y): (Vec<f64>, Vec<f64>) = course.iter().copied().unzip();
-            panel = panel.series(Series::line("", &x, &y).thin().color(1));
+            let name = if n == 0 { "each cell" } else { "" };
+            panel = panel.series(Series::line(name, &x, &y).thin().color(1));
         }
         let [cycle, mean, low, high] = mean_course(&courses);
         if !cycle.is_empty() {
@@ -301,6 +333,7 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
             .map(|row| format!("cell {}: {}", row.cell, row.run))
             .collect::<Vec<_>>(),
     );
+    page.command(&command_line());
     page
 }
 
