@@ -6,8 +6,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 to=${1:-target/page-pictures}
-cargo build --locked -p cellpos -p cellpos-firmware-sim
-cargo test --locked -p cellpos-tests --test all live_page::last_word:: -- --ignored --test-threads 1
+cargo test --locked --workspace --test all live_page::last_word:: -- --ignored --test-threads 1
 mkdir -p "$to"
 cp target/debug/live-page/{screen,word}-*.png "$to/"
 ls "$to"

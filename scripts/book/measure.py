@@ -62,7 +62,7 @@ def hold(bench: Bench, figures: Figures):
 
 
 def sine(bench: Bench, figures: Figures):
-    for name, law in (("pi", "--controller pi"), ("lqg", "--controller lqg"), ("learned", "--controller lqg --learn")):
+    for name, law in (("pi", "--controller pi"), ("lqg", "--controller lqg"), ("pi-learned", "--controller pi --learn"), ("learned", "--controller lqg --learn")):
         line = f"--target 0um --sine 5um@50Hz {law} --duration 6s --frames off"
         runs = track(bench, line)
         figures.put(f"sine.{name}", f"{law.removeprefix('--controller ').replace(' --', ', ')}: RMS error", mean(runs, "rms_true_nm"), "nm", 1,

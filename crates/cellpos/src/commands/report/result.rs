@@ -33,7 +33,7 @@ pub(super) fn section(
         });
     if let Some((before_um, after_um)) = learned {
         sentence.push_str(&format!(
-            " Learning took it from {} nm in the first cycles to {} nm in the last.",
+            " With learning: {} nm over the first few cycles, {} nm over the last few.",
             nm(before_um),
             nm(after_um)
         ));
