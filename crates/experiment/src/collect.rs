@@ -293,3 +293,7 @@ fn free_name(folder: &Path, experiment: Experiment) -> PathBuf {
         .find(|path| !path.exists())
         .unwrap_or_else(|| folder.join(experiment.name()))
 }
+
+#[cfg(test)]
+#[path = "collect_tests.rs"]
+mod table;

@@ -147,16 +147,18 @@ const PLAY_NUMBERS: &[FitParameter] = &{
     all
 };
 
+const BOUC_WEN_CANDIDATE: Candidate = Candidate {
+    name: "bouc-wen",
+    ..Candidate::chain(&[
+        lin("fraction", 0.0, 1.0, 1e-3),
+        log("beta_per_um", 0.02, 50.0),
+        lin("gamma_per_um", -20.0, 20.0, 1e-3),
+    ])
+    .typical(0.0, 0.6)
+};
+
 const CANDIDATES: &[Candidate] = &[
-    Candidate {
-        name: "bouc-wen",
-        ..Candidate::chain(&[
-            lin("fraction", 0.0, 1.0, 1e-3),
-            log("beta_per_um", 0.02, 50.0),
-            lin("gamma_per_um", -20.0, 20.0, 1e-3),
-        ])
-        .typical(0.0, 0.6)
-    },
+    BOUC_WEN_CANDIDATE,
     Candidate {
         name: "exponential play",
         ..Candidate::chain(&[
@@ -181,6 +183,12 @@ const CANDIDATES: &[Candidate] = &[
         name: "curved play",
         late: true,
         ..Candidate::chain(PLAY_NUMBERS)
+    },
+    // Of programs, not of piezos: one step of the equation a command.
+    Candidate {
+        name: "bouc-wen-explicit",
+        late: true,
+        ..BOUC_WEN_CANDIDATE
     },
 ];
 
@@ -256,7 +264,7 @@ impl EffectKind for PztHysteresis {
 
     fn starts(&self, index: usize, scope: &Scope) -> Vec<Vec<f64>> {
         match index {
-            0 => [0.3, 1.0, 3.0, 8.0]
+            0 | 5 => [0.3, 1.0, 3.0, 8.0]
                 .iter()
                 .flat_map(|b| [0.1, 0.35].map(|f| vec![f, (b / scope.stroke_um).min(40.0), 0.0]))
                 .collect(),
@@ -281,8 +289,9 @@ impl EffectKind for PztHysteresis {
         let at = |i: usize| values.get(i).copied().unwrap_or(0.0);
         let thresholds = LEVELS.map(|l| l * scope.stroke_um);
         match index {
-            0 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
+            0 => bouc_wen(at(0), at(1), at(2).clamp(-at(1), at(1))),
             1 => exponential_play(at(0), at(1)),
+            5 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
             2 | 4 => curved_play(
                 &thresholds,
                 &values[..LEVELS.len()],

@@ -65,6 +65,14 @@ struct Estimate {
 }
 
 impl Estimate {
+    fn alone(&self) -> Alone<'_> {
+        Alone {
+            values: &self.alone.0,
+            counts: &self.alone.1,
+            share: self.share,
+        }
+    }
+
     fn sigma(&self) -> f64 {
         NoiseModel::from_increments(self.c0, self.c1).innovation_um()
     }
@@ -110,11 +118,14 @@ pub(crate) fn estimate(
             c1,
             rows,
             source: FloorSource::Unknown,
-            alone: Default::default(),
+            alone: (e.clone(), present_i.clone()),
             share: 1.0,
         });
     }
     let quantum_um2 = quantisation_um2(records);
+    // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
+    let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
+    let kind = if unasked { NoiseKind::Walk } else { kind };
     let counts = |f: &Estimate| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0;
     // Where no record as a whole tells the noise, parts of them may: a misfit can only add.
     if !found.iter().any(counts) {
@@ -135,14 +146,7 @@ pub(crate) fn estimate(
     if let Some(least) = found.iter().min_by(|a, b| a.sigma().total_cmp(&b.sigma())) {
         let pooled = pooled(&found, least.sigma());
         let walk = NoiseModel::from_increments(pooled.c0, pooled.c1);
-        let alone = Alone {
-            values: &least.alone.0,
-            counts: &least.alone.1,
-            share: least.share,
-        };
-        // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
-        let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
-        let kind = if unasked { NoiseKind::Walk } else { kind };
+        let alone = least.alone();
         return Floor {
             noise: choose(kind, walk, &alone).at_least(quantum_um2),
             source: least.source,
@@ -155,7 +159,9 @@ pub(crate) fn estimate(
         .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
         .map(|least| {
             let all = pooled(&own, least.sigma());
-            NoiseModel::from_increments(all.c0, all.c1).at_least(quantum_um2)
+            let walk = NoiseModel::from_increments(all.c0, all.c1);
+            // What a base that was fitted to these records leaves is a sensor's noise or a slow disturbance: seldom a walk.
+            choose(kind, walk, &least.alone()).at_least(quantum_um2)
         });
     let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
     match (stated, residual) {

@@ -2,10 +2,10 @@
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::position_error::Locking;
-use crate::problem::{Mask, Problem};
-use crate::simulate::{Effect, Place, simulate};
+use crate::problem::{Mask, Prepared, Problem};
+use crate::simulate::{Base, Effect, Place, simulate};
 use crate::units::Scales;
-use cellpos_plant::effects::{Candidate, Role, Scope, find};
+use cellpos_plant::effects::{Action, Candidate, Role, Scope, find};
 use nalgebra::DMatrix;
 
 /// What the fit needs to know apart from the data: ranges, and the effects that the model already has.
@@ -58,6 +58,8 @@ pub(crate) struct Fit {
     pub parts: Vec<Part>,
     /// Share of the newest command \[um per um\].
     pub soft: f64,
+    /// Displacement from the model's working point to the records', if that is free \[um\].
+    pub offset_um: f64,
     /// Factor on the base model's gain; 1 unless it is free.
     pub gain: f64,
     /// Standard errors of `soft` and `gain`.
@@ -92,6 +94,19 @@ impl Fit {
     /// The parts that act in one way, in their order.
     pub(crate) fn of_role(&self, role: Role) -> impl Iterator<Item = &Part> {
         self.parts.iter().filter(move |p| p.variant().role == role)
+    }
+
+    /// Whether a part is a limit of its form: a number of it is at the end of its range, or may be anything in it.
+    pub(crate) fn is_limit(&self, index: usize) -> bool {
+        let part = &self.parts[index];
+        let before: usize = self.parts[..index].iter().map(|p| p.theta.len()).sum();
+        let numbers = part.variant().params.iter().zip(&part.theta).enumerate();
+        numbers.into_iter().any(|(j, (p, x))| {
+            let (low, high) = (p.coordinate(p.lower), p.coordinate(p.upper));
+            let (near, at) = (1e-4 * (high - low), before + j);
+            let sd = self.covariance[(at, at)].max(0.0).sqrt();
+            (p.log && (*x < low + near || 1.96 * sd > 0.5 * (high - low))) || *x > high - near
+        })
     }
 
     pub(crate) fn has(&self, id: &str) -> bool {
@@ -158,8 +173,41 @@ impl Context<'_> {
         effects
     }
 
+    /// Whether the working point is a number of the fit. Behind a linear chain an error of it is a ramp of the position, which is free
+    /// in every record. What bends the motion behind the piezo (a bead that sticks, a wall that stiffens) needs the point itself.
+    pub(crate) fn has_free_offset(&self, parts: &[Part]) -> bool {
+        let bends = |effect: &Effect| match effect.act() {
+            Action::Block(block) => effect.kind().spec().place >= Place::Chip && block.bends(),
+            _ => false,
+        };
+        self.problem.base.free_working_point && self.effects(parts).iter().any(bends)
+    }
+
+    /// Simulates a record about a working point that is `offset_um` from the model's.
+    pub(crate) fn simulate(
+        &self,
+        record: &Prepared,
+        effects: &[Effect],
+        offset_um: f64,
+        y: &mut Vec<f64>,
+        edge: Option<&mut Vec<f64>>,
+    ) {
+        let base = &self.problem.base;
+        let work = if offset_um == 0.0 {
+            simulate(base, (&record.u, &record.sampling), effects, y, edge)
+        } else {
+            let base = Base {
+                working_point_um: base.working_point_um + offset_um,
+                ..base.clone()
+            };
+            let u: Vec<f64> = record.u.iter().map(|u| u - offset_um).collect();
+            simulate(&base, (&u, &record.sampling), effects, y, edge)
+        };
+        self.problem.spend(work);
+    }
+
     /// Simulated positions of the records that count under a mask; empty for the others.
-    pub(crate) fn simulated(&self, parts: &[Part], mask: &Mask) -> Vec<Vec<f64>> {
+    pub(crate) fn simulated(&self, parts: &[Part], offset_um: f64, mask: &Mask) -> Vec<Vec<f64>> {
         let effects = self.effects(parts);
         self.problem
             .records
@@ -168,14 +216,7 @@ impl Context<'_> {
             .map(|(r, ranges)| {
                 let mut y = Vec::new();
                 if !ranges.is_empty() {
-                    let work = simulate(
-                        &self.problem.base,
-                        (&r.u, &r.sampling),
-                        &effects,
-                        &mut y,
-                        None,
-                    );
-                    self.problem.spend(work);
+                    self.simulate(r, &effects, offset_um, &mut y, None);
                 }
                 y
             })

@@ -107,6 +107,7 @@ impl Context<'_> {
         let fit = Fit {
             parts,
             soft: soft.unwrap_or(0.0),
+            offset_um: 0.0,
             gain: 1.0,
             errors: [0.0; 2],
             lines: vec![vec![[0.0; 2]; records]; lines],
@@ -245,6 +246,10 @@ impl Context<'_> {
                     position += 1;
                 }
             }
+        }
+        if self.has_free_offset(&fit.parts) {
+            t.offset_um += step[next];
+            next += 1;
         }
         t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);
         if self.free_gain {

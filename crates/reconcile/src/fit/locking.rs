@@ -10,7 +10,6 @@
 use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
 use crate::fit::position_error::{Locking, Numbers};
-use crate::simulate::simulate;
 use cellpos_plant::effects::Role;
 use nalgebra::Matrix5;
 use std::f64::consts::TAU;
@@ -242,13 +241,7 @@ fn tracks(ctx: &Context<'_>, fit: &Fit, at: usize) -> Vec<Track> {
         .zip(residual.into_iter().zip(sim))
         .map(|(r, (mut seen_um, path_um))| {
             let (mut edge, mut y) = (Vec::new(), Vec::new());
-            simulate(
-                &ctx.problem.base,
-                (&r.u, &r.sampling),
-                &effects,
-                &mut y,
-                Some(&mut edge),
-            );
+            ctx.simulate(r, &effects, fit.offset_um, &mut y, Some(&mut edge));
             for (seen, edge) in seen_um.iter_mut().zip(&edge) {
                 *seen -= fit.soft * edge;
             }

@@ -64,7 +64,13 @@ pub(super) fn answer(r: &mut Report, result: &Reconciliation) {
         ),
         Verdict::NothingMissing => (
             Emphasis::Good,
-            "Nothing is missing: the model is at the noise floor.".to_owned(),
+            match result.floor.is_known() {
+                true => "Nothing is missing: the model is at the noise floor.",
+                false => {
+                    "Nothing is missing: what is left does not follow the command. No rest and no repeated command tells the noise floor."
+                }
+            }
+            .to_owned(),
         ),
     };
     let g = &result.gap;

@@ -26,13 +26,13 @@ pub(crate) fn screen(
             jobs.extend(v.starts(&ctx.scope));
         }
     }
-    let sim = ctx.simulated(&fit.parts, mask);
+    let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
     let scores = cellpos_parallel::map(&jobs, threads, |part| match part.variant().role {
         Role::Line => line_score(ctx, fit, part.natural()[0], mask),
         _ => {
             let mut parts = fit.parts.clone();
             parts.push(part.clone());
-            let moved = ctx.simulated(&parts, mask);
+            let moved = ctx.simulated(&parts, fit.offset_um, mask);
             let d: Vec<Vec<f64>> = ctx
                 .problem
                 .records

@@ -29,6 +29,8 @@ pub(crate) struct Rival {
     pub id: &'static str,
     pub chi2: f64,
     pub part: Part,
+    /// Whether a number of it is at the end of its range, or may be anything in it.
+    pub is_limit: bool,
 }
 
 /// Sums of squares so far above that of a fit decide nothing beside it, whatever their prices.
@@ -184,11 +186,13 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
         let mut rivals: Vec<Vec<Rival>> = Vec::new();
         let mut better: Option<Fit> = None;
         let target = fit.chi2 + within(&fit);
-        let mut consider = |other: Fit, part: Part, list: &mut Vec<Rival>| {
+        let mut consider = |other: Fit, at: usize, list: &mut Vec<Rival>| {
+            let part = &other.parts[at];
             list.push(Rival {
                 id: part.id(),
                 chi2: other.chi2,
-                part,
+                part: part.clone(),
+                is_limit: other.is_limit(at),
             });
             if penalised_cost(ctx, &other) < penalised_cost(ctx, &fit) - 1.0
                 && better
@@ -215,10 +219,8 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 &[id],
                 [0.25 * (without.chi2 - fit.chi2), target],
             ) {
-                let Some(part) = other.parts.last().cloned() else {
-                    continue;
-                };
-                consider(other, part, &mut list);
+                let last = other.parts.len() - 1;
+                consider(other, last, &mut list);
             }
             // Screening is linear; a lag of another shape need not look promising from afar. Those of the same length
             // are fitted for certain.
@@ -254,8 +256,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 };
                 ctx.fit_towards(parts, Some(fit.soft), mask, until)
             }) {
-                let part = other.parts[i].clone();
-                consider(other, part, &mut list);
+                consider(other, i, &mut list);
             }
             rivals.push(list);
         }

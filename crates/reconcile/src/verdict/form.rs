@@ -177,11 +177,11 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
     let records = &ctx.problem.records;
     let mut out: Vec<Vec<Vec<f64>>> = vec![Vec::new(); records.len()];
     let mut curved = false;
-    let sim = ctx.simulated(&fit.parts, &all);
+    let sim = ctx.simulated(&fit.parts, fit.offset_um, &all);
     let moved = |k: usize, j: usize, step: f64| {
         let mut parts = fit.parts.clone();
         parts[k].theta[j] += step;
-        ctx.simulated(&parts, &all)
+        ctx.simulated(&parts, fit.offset_um, &all)
     };
     for &k in parts {
         let part = &fit.parts[k];

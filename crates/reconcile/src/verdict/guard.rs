@@ -104,7 +104,7 @@ pub(crate) fn working_point(
 /// model may come from these very records, it is no error but what there is to say of them.
 pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError> {
     let problem = ctx.problem;
-    let sim = ctx.simulated(&[], &problem.all());
+    let sim = ctx.simulated(&[], 0.0, &problem.all());
     let delays = delays(ctx);
     let (mut yy, mut count) = (0.0, 0.0);
     let mut white: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();

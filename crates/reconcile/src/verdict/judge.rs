@@ -76,10 +76,15 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     };
     if e.fit.parts.is_empty() {
         let beyond = excess > THRESHOLDS.null_sd * scatter || e.null_flagged || term.is_some();
-        if !e.floor.source.is_known() {
+        if !e.floor.source.is_known() && beyond {
             out.verdict = Verdict::Unknown;
             out.reasons
                 .push(no_floor(ctx, e, "nothing of the catalogue helps"));
+        } else if !e.floor.source.is_known() {
+            out.reasons.push(
+                "nothing says how large the noise is (no rest, no repeated command, no stated noise), but what is left does not follow the command"
+                    .to_owned(),
+            );
         } else if beyond && e.counted {
             // Missing frames are counted, whatever the rest is.
             out.verdict = Verdict::NamedWithRemainder;
@@ -114,13 +119,13 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         return out;
     }
     let remains = remains || moved.is_some();
-    let least = if e.cut_short {
-        THRESHOLDS.cut_closed
-    } else {
-        THRESHOLDS.remainder_closed
+    // One of several names, beside a remainder: only if the set is whole but for the last digits of its equations.
+    let least = match (e.cut_short, e.names.ambiguous) {
+        (true, _) => THRESHOLDS.cut_closed,
+        (false, true) => THRESHOLDS.closed_whole,
+        (false, false) => THRESHOLDS.remainder_closed,
     };
-    let unsure = e.names.ambiguous || closed < least;
-    if remains && unsure {
+    if remains && closed < least {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",

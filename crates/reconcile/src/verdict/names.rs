@@ -61,8 +61,12 @@ fn alternatives(
         });
         // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
         // unusual its size, unless what is left over says that the last percent decides nothing.
+        let richer = r.part.theta.len() > part.theta.len();
+        if richer && r.is_limit {
+            continue;
+        }
         let rough = over > THRESHOLDS.rough * fit.count as f64;
-        let price = if rough || r.part.theta.len() > part.theta.len() {
+        let price = if rough || richer {
             prior_penalty(&r.part, over) - prior_penalty(part, over)
         } else {
             0.0

@@ -196,7 +196,7 @@ pub(super) fn ratios(
     planner: &mut RealFftPlanner<f64>,
 ) -> Vec<BandRatio> {
     let sample_s = ctx.problem.base.sample_s;
-    let sim = ctx.simulated(&fit.parts, &ctx.problem.all());
+    let sim = ctx.simulated(&fit.parts, fit.offset_um, &ctx.problem.all());
     let centres = centres(sample_s);
     let mut bands = vec![Band::default(); centres.len()];
     for (i, r) in ctx.problem.records.iter().enumerate() {

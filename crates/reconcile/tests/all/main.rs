@@ -4,6 +4,7 @@ mod labelled;
 mod measured;
 mod measured_piezo;
 mod noise;
+mod nulls;
 mod traits;
 mod units;
 mod verdicts;

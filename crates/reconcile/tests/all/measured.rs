@@ -27,14 +27,14 @@ fn columns(path: &Path, input: &str, output: &str) -> (Vec<f64>, Vec<f64>) {
         .unzip()
 }
 
-struct Set {
-    sample_s: f64,
-    order: usize,
-    hold: Hold,
-    files: Vec<(String, Vec<f64>, Vec<f64>)>,
+pub(super) struct Set {
+    pub(super) sample_s: f64,
+    pub(super) order: usize,
+    pub(super) hold: Hold,
+    pub(super) files: Vec<(String, Vec<f64>, Vec<f64>)>,
 }
 
-fn set(
+pub(super) fn set(
     name: &str,
     files: &[&str],
     io: (&str, &str),
@@ -59,7 +59,7 @@ fn set(
 
 impl Set {
     /// The linear model that `identify` fits to one of its files, as it stands in the file that it writes.
-    fn base(&self, of: usize) -> Model {
+    pub(super) fn base(&self, of: usize) -> Model {
         let settings = ForeignSettings {
             rate_hz: 1.0 / self.sample_s,
             most_order: self.order,
@@ -81,7 +81,7 @@ impl Set {
         model
     }
 
-    fn records(&self, rows: impl Fn(usize) -> std::ops::Range<usize>) -> Vec<Record> {
+    pub(super) fn records(&self, rows: impl Fn(usize) -> std::ops::Range<usize>) -> Vec<Record> {
         self.files
             .iter()
             .map(|(name, u, y)| {
@@ -92,7 +92,11 @@ impl Set {
             .collect()
     }
 
-    fn run(&self, model: &Model, records: &[Record]) -> Result<Reconciliation, ReconcileError> {
+    pub(super) fn run(
+        &self,
+        model: &Model,
+        records: &[Record],
+    ) -> Result<Reconciliation, ReconcileError> {
         self.run_with(model, records, &[])
     }
 
@@ -281,7 +285,7 @@ fn mean_error(model: &Model, s: &Set, u: &[f64], y: &[f64]) -> f64 {
     y.iter().zip(&simulated).map(|(y, s)| y - s).sum::<f64>() / y.len() as f64
 }
 
-fn free_response(model: &Model, hold: Hold, sample_s: f64, u: &[f64]) -> Vec<f64> {
+pub(super) fn free_response(model: &Model, hold: Hold, sample_s: f64, u: &[f64]) -> Vec<f64> {
     /// A sampled input goes on smoothly: so many steps a row come close to that.
     const STEPS: usize = 20;
     let options = SimulateOptions::default();

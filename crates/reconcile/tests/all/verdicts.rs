@@ -209,12 +209,14 @@ fn a_hysteresis_that_any_curve_explains_is_no_name() {
     );
 }
 
-/// Random records without rest, repeat or stated noise, some with an effect: none may be named.
+/// Random records without rest, repeat or stated noise, three of four with an effect: none may be named, and only where none is hidden
+/// may nothing be missing.
 fn never_named(count: u64) {
     let silent = Model {
         noise: Noise::NONE,
         ..plant()
     };
+    let mut nothing = 0;
     for seed in 0..count {
         let truth = match seed % 4 {
             0 => plant(),
@@ -227,14 +229,19 @@ fn never_named(count: u64) {
             &[record("only", &truth, &levels(900, 1.0, seed), seed + 1000)],
         );
         assert_eq!(r.floor, FloorSource::Unknown, "seed {seed}");
-        assert_eq!(r.verdict, Verdict::Unknown, "seed {seed}: {:?}", named(&r));
-        assert!(r.effects.is_empty());
+        assert!(r.effects.is_empty(), "seed {seed}: {:?}", named(&r));
+        if seed % 4 == 0 && r.verdict == Verdict::NothingMissing {
+            nothing += 1;
+            continue;
+        }
+        assert_eq!(r.verdict, Verdict::Unknown, "seed {seed}");
         assert!(
             r.places.iter().any(|p| p.contains("record a rest of 10 s")),
             "{:?}",
             r.places
         );
     }
+    assert!(10 * nothing >= 9 * count / 4, "{nothing} of {}", count / 4);
 }
 
 #[test]

@@ -7,6 +7,9 @@
 //! in proportion to the commands for long. Commands that cancel a flow look as if neither moved the bead: one that does not feel
 //! them is looked for only while it goes further and further away.
 //!
+//! A picture that shakes and an actuator that rings move the bead in no hypothesis of these. A wrong sign must then predict the motion
+//! better than its mere size does.
+//!
 //! Limit: a flow of more than 2 um that rises within 40 ms (1 % to 99 %) grows just as a loop with a wrong sign does, and can be taken
 //! for one.
 
@@ -26,6 +29,9 @@ const FLIP_SD: f64 = 0.1;
 const GAIN_MEMORY_S: f64 = 1.0;
 /// Time over which commands are averaged, to count them from there, s: a hundred delays.
 const MEAN_S: f64 = 0.25;
+/// Time over which the mean square of the bead's motion in a tick is taken, s. One that grows e-fold in 8 ms is then six times its mean,
+/// sqrt(0.15 / 0.004), which speaks against a mere shake.
+const SHAKE_S: f64 = 0.15;
 /// A flow starts to change as often as it steps, so often in a second.
 const CHANGES_PER_S: f64 = 0.01;
 /// Delays in which a flow that grows at its fastest grows by a factor e: 5 ms. A loop with a wrong sign does in 8 ms, the solution
@@ -270,6 +276,11 @@ struct Beliefs {
     with: Belief,
     against: Rival,
     adrift: Rival,
+    /// The fix before, um, and the mean square of the motion in a tick.
+    before_um: f64,
+    motion_um2: f64,
+    /// How much likelier a wrong sign is than that something shakes bead or picture, natural logarithm of the odds.
+    beyond_shake: f64,
     /// Ticks for which the bead has been away from its reference.
     away: f64,
     /// Those at which its distance was compared last, the distance, um, and whether it was going further away.
@@ -277,6 +288,15 @@ struct Beliefs {
 }
 
 impl Beliefs {
+    /// Logarithm of the likelihood of a fix if something shakes bead or picture: all that is known of its motion is the size.
+    fn shaken(&mut self, position_um: f64, ticks: f64, share: f64) -> f64 {
+        let moved_um = position_um - self.before_um;
+        self.before_um = position_um;
+        let spread_um2 = self.motion_um2 * ticks;
+        self.motion_um2 += share * (moved_um * moved_um / ticks - self.motion_um2);
+        -0.5 * (moved_um * moved_um / spread_um2 + (std::f64::consts::TAU * spread_um2).ln())
+    }
+
     /// Takes in a distance from the reference, um, `ticks` after the one before; `shortest` is the time that tells something.
     fn watch_distance(&mut self, off_um: f64, ticks: f64, shortest: f64) {
         let (at, before_um, _) = self.compared;
@@ -319,6 +339,7 @@ pub(super) struct Following {
     known: usize,
     mean_um: f64,
     mean_share: f64,
+    shake_share: f64,
     /// None until a fix is known.
     beliefs: Option<Beliefs>,
     since_fix: f64,
@@ -360,6 +381,7 @@ impl Following {
             known: 0,
             mean_um: 0.0,
             mean_share: (sample_s / MEAN_S).min(1.0),
+            shake_share: (sample_s / SHAKE_S).min(1.0),
             beliefs: None,
             since_fix: 0.0,
         }
@@ -420,6 +442,9 @@ impl Following {
                 with,
                 against: Rival::of(with.against(), zero_flow_um),
                 adrift: Rival::of(with.adrift(driven_um), zero_flow_um),
+                before_um: position_um,
+                motion_um2: self.noise.walk_um2 + 2.0 * variance_um2,
+                beyond_shake: 0.0,
                 away: 0.0,
                 compared: (0.0, 0.0, false),
             });
@@ -435,19 +460,24 @@ impl Following {
         let likely =
             |belief: &mut Belief| belief.correct(position_um, variance_um2, ticks, &self.noise);
         let usual = likely(&mut beliefs.with);
-        for rival in [&mut beliefs.against, &mut beliefs.adrift] {
-            rival.evidence += likely(&mut rival.belief) - usual;
-        }
+        beliefs.adrift.evidence += likely(&mut beliefs.adrift.belief) - usual;
+        let against = likely(&mut beliefs.against.belief);
+        beliefs.against.evidence += against - usual;
+        beliefs.beyond_shake += against - beliefs.shaken(position_um, ticks, self.shake_share);
         if beliefs.against.evidence <= 0.0 {
             beliefs.against = Rival::of(beliefs.with.against(), zero_flow_um);
+            beliefs.beyond_shake = 0.0;
         }
         if beliefs.adrift.evidence <= 0.0 || !is_away {
             beliefs.adrift = Rival::of(beliefs.with.adrift(driven_um), zero_flow_um);
         }
         let Beliefs {
-            against, adrift, ..
+            against,
+            adrift,
+            beyond_shake,
+            ..
         } = beliefs;
-        if against.evidence > EVIDENCE.max(adrift.evidence) {
+        if against.evidence.min(*beyond_shake) > EVIDENCE.max(adrift.evidence) {
             return Some((Instead::Against, against.zero_flow_um));
         }
         let goes = adrift.evidence > EVIDENCE && beliefs.compared.2;

@@ -14,6 +14,12 @@ struct World<'a> {
     range: &'a dyn Fn(f64) -> [f64; 2],
     zero_flow: &'a dyn Fn(f64) -> f64,
     reference: &'a dyn Fn(f64) -> f64,
+    /// What is added to the command, um.
+    added: &'a dyn Fn(f64) -> f64,
+    /// What the picture shakes by, um.
+    shakes: &'a dyn Fn(f64) -> f64,
+    /// Frequency \[Hz\] and damping of an actuator that rings.
+    rings: Option<(f64, f64)>,
     /// Ticks that never come.
     lost: &'a dyn Fn(u64) -> bool,
     seconds: f64,
@@ -29,6 +35,9 @@ impl Default for World<'_> {
             range: &|_| [0.0, 40.0],
             zero_flow: &|_| 20.0,
             reference: &|_| 0.0,
+            added: &|_| 0.0,
+            shakes: &|_| 0.0,
+            rings: None,
             lost: &|_| false,
             seconds: 11.0,
         }
@@ -51,10 +60,24 @@ fn told(world: &World<'_>) -> Option<Told> {
     let late = (2e-3 * world.rate_hz).round() as usize;
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
     let mut seen = std::collections::VecDeque::from(vec![0.0; late + 1]);
+    let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
     for k in 0..(world.seconds * world.rate_hz) as u64 {
         let t = k as f64 * dt;
         let [low_um, high_um] = (world.range)(t);
-        let pushed_um = command_um.clamp(low_um, high_um) - (world.zero_flow)(t);
+        let mut asked_um = command_um.clamp(low_um, high_um);
+        if let Some((hz, damping)) = world.rings {
+            const STEPS: u32 = 50;
+            let (w, h) = (std::f64::consts::TAU * hz, dt / f64::from(STEPS));
+            let mut sum_um = 0.0;
+            for _ in 0..STEPS {
+                reached_um_per_s +=
+                    h * (w * w * (asked_um - reached_um) - 2.0 * damping * w * reached_um_per_s);
+                reached_um += h * reached_um_per_s;
+                sum_um += reached_um;
+            }
+            asked_um = sum_um / f64::from(STEPS);
+        }
+        let pushed_um = asked_um - (world.zero_flow)(t);
         bead_um += world.axis * (world.gain_ratio)(t) * 380.0 * dt * pushed_um
             + (0.66 * dt).sqrt() * noise(&mut state);
         seen.push_back(bead_um);
@@ -63,11 +86,11 @@ fn told(world: &World<'_>) -> Option<Told> {
             following.skip(command_um);
             continue;
         }
-        let fix_um = seen[0] + 0.015 * noise(&mut state);
+        let fix_um = seen[0] + (world.shakes)(t) + 0.015 * noise(&mut state);
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
         zero_um -= 8.0 * dt * error_um;
-        command_um = (zero_um - 0.4 * error_um).clamp(0.0, 40.0);
+        command_um = (zero_um - 0.4 * error_um + (world.added)(t)).clamp(0.0, 40.0);
         let found = following.step(&Seen {
             fix: Some((fix_um, 0.015_f64.powi(2))),
             reference_um,
@@ -200,5 +223,42 @@ fn a_loop_that_loses_ticks_in_fast_motion_is_not_taken_for_one_with_a_wrong_sign
             ..World::default()
         });
         assert_eq!(told, None, "seed {seed}");
+    }
+}
+
+#[test]
+fn an_actuator_that_rings_under_many_lines_is_not_taken_for_one_with_a_wrong_sign() {
+    const LINES_HZ: [f64; 14] = [
+        1.5, 2.5, 4.5, 7.5, 12.5, 20.5, 33.5, 54.5, 87.5, 140.5, 197.5, 293.5, 353.5, 431.5,
+    ];
+    for seed in 1..=10 {
+        for hz in [220.0, 280.0, 340.0] {
+            let line = |t: f64, (n, hz): (usize, &f64)| {
+                0.05 * (std::f64::consts::TAU * hz * t + (seed * (n * n) as u64) as f64).sin()
+            };
+            let told = told(&World {
+                seed,
+                rings: Some((hz, 0.1)),
+                added: &|t| LINES_HZ.iter().enumerate().map(|of| line(t, of)).sum(),
+                seconds: 8.0,
+                ..World::default()
+            });
+            assert_eq!(told, None, "{hz} Hz, seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn a_picture_that_shakes_is_not_taken_for_a_bead_that_does_not_follow() {
+    for seed in 1..=4 {
+        for hz in [8.0, 30.0, 50.0, 77.0, 154.0, 300.0] {
+            let told = told(&World {
+                seed,
+                shakes: &|t| 0.5 * (std::f64::consts::TAU * hz * t).sin(),
+                seconds: 8.0,
+                ..World::default()
+            });
+            assert_eq!(told, None, "{hz} Hz, seed {seed}");
+        }
     }
 }
