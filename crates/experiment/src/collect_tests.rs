@@ -13,8 +13,11 @@ use cellpos_session::Failure;
 use cellpos_session::rig_file::{Frames, RigFile};
 use std::path::Path;
 
-/// The rows: a name for the file, what is hidden, and the numbers that must be inside their intervals.
-fn rows() -> Vec<(&'static str, Option<Effect>, &'static [(&'static str, f64)])> {
+/// An id, what is hidden, and the numbers that must be inside their intervals.
+type Row = (&'static str, Option<Effect>, &'static [(&'static str, f64)]);
+
+/// One effect each, and nothing.
+fn rows() -> Vec<Row> {
     vec![
         ("nothing", None, &[]),
         (

@@ -189,15 +189,7 @@ impl Context<'_> {
             }
         }
         if self.has_free_offset(&fit.parts) {
-            let moved = self.simulated(&fit.parts, fit.offset_um + OFFSET_STEP_UM, mask);
-            for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
-                let d: Vec<f64> = moved[i]
-                    .iter()
-                    .zip(&state.sim[i])
-                    .map(|(a, b)| (b - fit.gain * a) / OFFSET_STEP_UM)
-                    .collect();
-                columns[i].push((next, r.whitened(&d)));
-            }
+            self.add_offset_columns(fit, state, mask, next, &mut columns);
             next += 1;
         }
         for (columns, soft) in columns.iter_mut().zip(&state.soft) {
@@ -220,6 +212,29 @@ impl Context<'_> {
             next += 1;
         }
         (next, columns)
+    }
+
+    /// Adds the derivative by the working point, as number `index`.
+    fn add_offset_columns(
+        &self,
+        fit: &Fit,
+        state: &State,
+        mask: &Mask,
+        index: usize,
+        columns: &mut [Columns],
+    ) {
+        let moved = self.simulated(&fit.parts, fit.offset_um + OFFSET_STEP_UM, mask);
+        for (i, r) in self.problem.records.iter().enumerate() {
+            if mask[i].is_empty() {
+                continue;
+            }
+            let d: Vec<f64> = moved[i]
+                .iter()
+                .zip(&state.sim[i])
+                .map(|(a, b)| (b - fit.gain * a) / OFFSET_STEP_UM)
+                .collect();
+            columns[i].push((index, r.whitened(&d)));
+        }
     }
 
     /// The parts with one parameter moved by its step, towards the inside of its bounds.
