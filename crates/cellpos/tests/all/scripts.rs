@@ -235,7 +235,7 @@ fn a_rehearsal_behaves_as_the_model_it_is_given() {
     );
     // Preview: the amplitude is there, whatever the frequency.
     let error = run["amplitude_error_percent"].as_f64().unwrap();
-    assert!(error.abs() < 2.0, "{error}");
+    assert!(error.abs() < 3.0, "{error}");
 }
 
 #[test]
