@@ -216,26 +216,33 @@ fn a_rehearsal_behaves_as_the_model_it_is_given() {
     )
     .unwrap();
     std::fs::write(folder.path().join("model.toml"), eq6).unwrap();
-    let run = json(
-        folder.path(),
-        &[
-            "run",
-            "quick.toml",
-            "--dry",
-            "--model",
-            "model.toml",
-            "--controller",
-            "mpc",
-            "--json",
-        ],
-    );
-    assert_eq!(
-        (&run["outcome"], &run["cycles_done"]),
-        (&"done".into(), &60.into())
-    );
-    // Preview: the amplitude is there, whatever the frequency.
-    let error = run["amplitude_error_percent"].as_f64().unwrap();
-    assert!(error.abs() < 3.0, "{error}");
+    let error_percent = |seed: u64| {
+        let run = json(
+            folder.path(),
+            &[
+                "run",
+                "quick.toml",
+                "--dry",
+                "--model",
+                "model.toml",
+                "--controller",
+                "mpc",
+                "--seed",
+                &seed.to_string(),
+                "--json",
+            ],
+        );
+        assert_eq!(
+            (&run["outcome"], &run["cycles_done"]),
+            (&"done".into(), &60.into())
+        );
+        run["amplitude_error_percent"].as_f64().unwrap()
+    };
+    // Preview: the amplitude is there, whatever the frequency. Noise and the learning of the gain scatter it by 1 % in a run: four
+    // together tell twice as much as one within 2 %.
+    let errors = [1, 2, 3, 4].map(error_percent);
+    let mean = errors.iter().sum::<f64>() / 4.0;
+    assert!(mean.abs() < 1.0, "{errors:?}");
 }
 
 #[test]
