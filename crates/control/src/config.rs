@@ -41,6 +41,11 @@ impl ControllerKind {
             _ => return None,
         })
     }
+
+    /// Whether the law follows gain and delay by default. PI and lead are robust without it, and are chosen for that.
+    pub fn adapts(self) -> bool {
+        matches!(self, Self::Lqg | Self::Mpc)
+    }
 }
 
 /// Gains of the PI controller as the file writes them.

@@ -404,12 +404,11 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
                 "write pi, lead, lqg, mpc, or the path of a controller.toml",
             ));
         }
-        let path = name;
-        let file = ControllerFile::load(Path::new(path)).map_err(Failure::input)?;
+        let file = ControllerFile::load(Path::new(name)).map_err(Failure::input)?;
         if (file.delay_ms * 1e-3 - loop_delay_s).abs() > WORTH_SAYING * sample_s {
             return Err(Failure::bad_input(
                 format!(
-                    "{path}: it is for a loop delay of {} ms, but the rig has {} ms",
+                    "{name}: it is for a loop delay of {} ms, but the rig has {} ms",
                     file.delay_ms,
                     loop_delay_s * 1e3
                 ),
@@ -446,8 +445,7 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
     if let Some(config) = &report.config {
         file.estimator = config.estimator;
     }
-    // PI is robust without it, and is chosen for that.
-    file.estimator.adapt = matches!(kind, ControllerKind::Lqg | ControllerKind::Mpc);
+    file.estimator.adapt = kind.adapts();
     Ok(file)
 }
 

@@ -416,7 +416,6 @@ fn controller_file(
         file.estimator = config.estimator;
         file.limits = config.limits;
     }
-    let kind = file.controller;
-    file.estimator.adapt = matches!(kind, ControllerKind::Lqg | ControllerKind::Mpc);
+    file.estimator.adapt = file.controller.adapts();
     Ok(file)
 }
