@@ -28,25 +28,37 @@
 //! # Ok::<(), cellpos_live::LiveError>(())
 //! ```
 #![forbid(unsafe_code)]
+// What only the server reads of a feed has no reader without it.
+#![cfg_attr(not(feature = "server"), allow(dead_code))]
 
+#[cfg(feature = "server")]
 mod access;
+#[cfg(feature = "server")]
 mod client;
 mod command;
 mod feed;
 mod film;
+#[cfg(feature = "server")]
 mod http;
+#[cfg(feature = "server")]
 mod hub;
+#[cfg(feature = "server")]
 mod page;
+#[cfg(feature = "server")]
 mod queue;
 mod row;
+#[cfg(feature = "server")]
 mod server;
+#[cfg(feature = "server")]
 mod shared;
 mod state;
 
+#[cfg(feature = "server")]
 pub use access::{Role, Secrets};
 pub use command::{CommandError, OperatorRequest};
 pub use feed::{Feed, FeedHub, Line, Lost, PictureFeed};
 pub use film::{Film, FilmFrame, film_bytes};
 pub use row::{OUTLINE_POINTS, PICTURE_MARGIN, Picture, Row};
+#[cfg(feature = "server")]
 pub use server::{LiveError, MOST_CLIENTS, Server, ServerConfig};
 pub use state::{Banner, ClipLine, CycleRow, EventLine, Hello, LastWord, State};

@@ -4,7 +4,6 @@
 //! after that. A thread that hangs in the kernel blocks only itself; unconfirmed rows count as lost.
 
 use crate::error::RecordError;
-use crate::export::{Selection, Source};
 use crate::faults::Faults;
 use crate::meta::{RunEnd, RunMeta};
 use crate::reader::RunReader;
@@ -179,10 +178,18 @@ impl Ending {
     }
 }
 
+/// Writes `ticks.parquet`; without the feature there is none, and none is missing.
+#[cfg(feature = "parquet")]
 fn parquet(folder: &Path) -> Result<(), RecordError> {
     let run = RunReader::open(folder)?;
     let path = folder.join(TICKS_PARQUET);
-    crate::write_parquet(&Source::single(run), &Selection::default(), &path).map(|_| ())
+    let (source, all) = (crate::Source::single(run), crate::Selection::default());
+    crate::write_parquet(&source, &all, &path).map(|_| ())
+}
+
+#[cfg(not(feature = "parquet"))]
+fn parquet(_: &Path) -> Result<(), RecordError> {
+    Ok(())
 }
 
 /// Rows that come back from the disk.

@@ -7,7 +7,7 @@
 //! | `run.toml` | command line, configuration, model, controller, versions, conditions, seed, SHA-256 of inputs; the outcome | at the start, replaced in one step at the end |
 //! | `ticks.arrow` | one row a tick ([`cellpos_runtime::TickRecord`]), an Arrow IPC stream | appended, synced at least each second |
 //! | `events.jsonl` | one JSON object a line | with the ticks, after them |
-//! | `ticks.parquet` | the same rows for other programs | at the end |
+//! | `ticks.parquet` | the same rows for other programs | at the end, with the feature `parquet` |
 //! | `cycles.csv` | of a script: one row a cycle ([`LineFile`]) | appended, synced at least each second |
 //! | `cycles.parquet` | the same | at the end |
 //! | `learned.toml` | of a script: the feed-forward learned over its cycles | replaced in one step each second |
@@ -59,10 +59,9 @@ mod writer;
 pub use columns::Group;
 pub use error::RecordError;
 pub use events::{Event, Events, read_events};
-pub use export::{
-    Exported, Format, Part, Selection, Source, TableColumn, csv_head, export, write_csv,
-    write_parquet, write_table_parquet,
-};
+pub use export::{Exported, Format, Part, Selection, Source, csv_head, export, write_csv};
+#[cfg(feature = "parquet")]
+pub use export::{TableColumn, write_parquet, write_table_parquet};
 pub use faults::Faults;
 pub use follow::Follow;
 pub use lines::{LineFile, whole_text};

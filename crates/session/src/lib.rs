@@ -34,6 +34,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adapt;
+#[cfg(any(feature = "page", feature = "screen"))]
 mod beside;
 pub mod clips;
 pub mod connect;

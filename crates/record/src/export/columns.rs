@@ -54,6 +54,15 @@ impl Column<'_> {
     }
 }
 
+/// Words and their numbers in a line.
+pub(crate) fn listed(codes: Codes) -> String {
+    let each: Vec<String> = codes
+        .iter()
+        .map(|(number, word)| format!("{number} {word}"))
+        .collect();
+    each.join(", ")
+}
+
 /// The word for a number, if it has one.
 pub fn word(codes: Codes, number: u8) -> Option<&'static str> {
     codes

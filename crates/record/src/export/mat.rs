@@ -3,8 +3,7 @@
 //! The rows are counted first, so that every variable has its place in the file before its values come, some rows of all
 //! variables at a time.
 
-use super::columns::{Column, Row, Value, word};
-use super::parquet::listed;
+use super::columns::{Column, Row, Value, listed, word};
 use super::{Exported, Selection, Source, whole};
 use crate::error::RecordError;
 use std::fs::File;

@@ -5,12 +5,14 @@ mod csv;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod mat;
+#[cfg(feature = "parquet")]
 mod parquet;
 
 pub use csv::{csv_head, write_csv};
 #[cfg(feature = "hdf5")]
 pub use hdf5::{write_hdf5, write_rtdc};
 pub use mat::write_mat;
+#[cfg(feature = "parquet")]
 pub use parquet::{TableColumn, write_parquet, write_table_parquet};
 
 use crate::error::RecordError;
@@ -33,7 +35,7 @@ pub(crate) const ROWS_AT_A_TIME: usize = 8192;
 pub enum Format {
     /// Text.
     Csv,
-    /// Apache Parquet, uncompressed, words as dictionaries.
+    /// Apache Parquet, uncompressed, words as dictionaries. Only with the feature `parquet`.
     Parquet,
     /// HDF5: ticks, cycles, events and metadata in one file. Only where the crate is built with the feature `hdf5`.
     Hdf5,
@@ -282,7 +284,13 @@ pub fn export(
             io::Write::flush(&mut out).map_err(RecordError::io("cannot write", path))?;
             Ok(done)
         }),
+        #[cfg(feature = "parquet")]
         Format::Parquet => write_parquet(source, selection, path),
+        #[cfg(not(feature = "parquet"))]
+        Format::Parquet => Err(RecordError::Encode {
+            what: "Parquet",
+            message: "this program was built without the feature parquet".to_owned(),
+        }),
         #[cfg(feature = "hdf5")]
         Format::Hdf5 => write_hdf5(source, selection, path),
         #[cfg(feature = "hdf5")]

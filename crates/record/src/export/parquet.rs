@@ -1,6 +1,6 @@
 //! A run as Apache Parquet: numbers that do not exist are null, words are dictionaries, unit and meaning are with each column.
 
-use super::columns::{Codes, Column, Row, Value, word};
+use super::columns::{Column, Row, Value, listed, word};
 use super::{Exported, Selection, Source, whole};
 use crate::error::RecordError;
 use arrow_array::builder::StringDictionaryBuilder;
@@ -116,15 +116,6 @@ fn schema(columns: &[Column<'_>], source: &Source) -> SchemaRef {
         }
     }
     Arc::new(Schema::new_with_metadata(fields, about))
-}
-
-/// Words and their numbers in a line.
-pub(crate) fn listed(codes: Codes) -> String {
-    let each: Vec<String> = codes
-        .iter()
-        .map(|(number, word)| format!("{number} {word}"))
-        .collect();
-    each.join(", ")
 }
 
 fn array(column: &Column<'_>, rows: &[Row]) -> ArrayRef {

@@ -7,27 +7,19 @@
 //! The screen thread draws ten times a second and never writes: its drawing goes to [`cellpos_terminal`], and only its thread
 //! waits for the terminal. A picture that finds the one before it unwritten is left out, and the next one is drawn whole.
 
+#[cfg(feature = "screen")]
 mod ansi;
+#[cfg(feature = "screen")]
 mod draw;
+#[cfg(feature = "screen")]
 mod history;
+#[cfg(feature = "screen")]
+mod shown;
 
-use crate::beside::beside_the_loop;
+#[cfg(feature = "screen")]
+pub use shown::Screen;
+
 use crate::live_line::Typed;
-use ansi::Ansi;
-use cellpos_live::{FeedHub, Line};
-use cellpos_terminal::Terminal;
-use history::History;
-use ratatui::Terminal as Cells;
-use std::io;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
-use std::time::Duration;
-
-/// Time between two pictures.
-const EVERY: Duration = Duration::from_millis(100);
-/// Longest wait for the terminal when the screen releases it.
-const PATIENCE: Duration = Duration::from_secs(1);
 
 /// Further texts of the screen.
 #[derive(Debug, Clone, Default)]
@@ -38,106 +30,19 @@ pub struct ScreenConfig {
     pub typed: Typed,
 }
 
-/// The terminal while a run has it. Dropping it releases the terminal.
-pub struct Screen {
-    stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
-}
+/// The terminal while a run has it: built without the feature `screen`, no run has.
+#[cfg(not(feature = "screen"))]
+pub enum Screen {}
 
+#[cfg(not(feature = "screen"))]
 impl Screen {
-    /// Takes the terminal behind standard error.
+    /// Refuses.
     ///
     /// # Errors
-    /// Standard error is no terminal, or no thread could be had.
-    pub fn open(config: &ScreenConfig, hub: FeedHub) -> io::Result<Self> {
-        if !io::IsTerminal::is_terminal(&io::stderr()) {
-            return Err(io::Error::other(
-                "--tui needs a terminal behind standard error",
-            ));
-        }
-        let terminal = cellpos_terminal::stderr();
-        terminal.open_screen();
-        let stop = Arc::new(AtomicBool::new(false));
-        let mut shown = Shown {
-            hub,
-            history: History::default(),
-            config: config.clone(),
-        };
-        let asked = Arc::clone(&stop);
-        let thread = std::thread::Builder::new()
-            .name("cellpos-screen".to_string())
-            .spawn(move || {
-                beside_the_loop();
-                shown.serve(terminal, &asked);
-            });
-        match thread {
-            Ok(thread) => Ok(Self {
-                stop,
-                thread: Some(thread),
-            }),
-            Err(error) => {
-                terminal.close_screen(PATIENCE);
-                Err(error)
-            }
-        }
-    }
-}
-
-impl Drop for Screen {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Release);
-        if let Some(thread) = self.thread.take() {
-            // One that panicked has drawn nothing further.
-            let _ = thread.join();
-        }
-        cellpos_terminal::stderr().close_screen(PATIENCE);
-    }
-}
-
-struct Shown {
-    hub: FeedHub,
-    history: History,
-    config: ScreenConfig,
-}
-
-impl Shown {
-    fn serve(&mut self, terminal: &Terminal, stop: &AtomicBool) {
-        let Ok(mut cells) = Cells::new(Ansi::default());
-        while !stop.load(Ordering::Acquire) {
-            self.take();
-            self.history.said = terminal.heard();
-            if terminal.can_draw() {
-                self.picture(&mut cells);
-                let sequence = cells.backend_mut().take();
-                if !terminal.draw(sequence) {
-                    // What is on the terminal is not known any more.
-                    let _ = cells.clear();
-                }
-            }
-            std::thread::sleep(EVERY);
-        }
-    }
-
-    fn take(&mut self) {
-        let cell = self.hub.hello().cell;
-        while let Some(row) = self.hub.next_row() {
-            self.history.row(&row);
-        }
-        while let Some(line) = self.hub.next_line() {
-            match line {
-                Line::State(state) => self.history.state(*state, cell),
-                Line::Event(event) => self.history.event(event, cell),
-                Line::Cycle(cycle) => self.history.cycle(cycle),
-                Line::Clip(_) => {}
-            }
-        }
-    }
-
-    fn picture(&mut self, cells: &mut Cells<Ansi>) {
-        let (hello, typed) = (self.hub.hello(), self.config.typed.text());
-        // Drawing into memory cannot fail.
-        let _ = cells.draw(|frame| {
-            draw::screen(frame, hello, &self.history, self.config.keys, &typed);
-        });
+    /// Always: the feature is missing.
+    pub fn open(_: &ScreenConfig, _: cellpos_live::FeedHub) -> std::io::Result<Self> {
+        Err(std::io::Error::other(
+            "this program was built without the feature screen, the view on the whole terminal",
+        ))
     }
 }

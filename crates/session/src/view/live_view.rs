@@ -3,33 +3,23 @@
 use super::hello::{Page, hello};
 use super::last_word;
 use super::pictures::Pictures;
+use super::served::{Server, ViewAddress, serve};
 use super::watcher::Watcher;
-use crate::beside::beside_the_loop;
 use crate::clips;
 use crate::failure::Failure;
 use crate::rig::Rig;
 use crate::screen::{Screen, ScreenConfig};
 use crate::setup::Setup;
-use cellpos_live::{Feed, Film, Hello, OperatorRequest, Server, ServerConfig};
+use cellpos_live::{Feed, Film, Hello, OperatorRequest};
 use cellpos_rig::FrameWatch;
 use cellpos_runtime::Request;
 use cellpos_runtime::live::Operator;
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Frames of a clip that the page gets: half a second of a fast camera.
 const FILM_FRAMES: usize = 250;
-
-/// Where the page is to be served.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ViewAddress {
-    /// Address and port; port 0: any that is free.
-    pub address: SocketAddr,
-    /// Whether one that other machines can reach was asked for by name.
-    pub beyond_this_machine: bool,
-}
 
 /// How a run is to be shown.
 #[derive(Debug, Clone, Default)]
@@ -93,10 +83,7 @@ impl View {
             }
             let asked = Arc::clone(&addressee);
             let act = move |command| act(command, &asked, &noted);
-            let config = config(at, Some(film(&run)));
-            server = Some(Server::start(&config, hub, act).map_err(|error| {
-                Failure::bad_input(error, "--view 127.0.0.1:0 takes any free port")
-            })?);
+            server = Some(serve(at, film(&run), hub, act)?);
             feeds.push(feed);
         }
         let mut screen = None;
@@ -218,16 +205,6 @@ impl Pages {
             let how = if done { "done" } else { "stopped" };
             watcher.over(last_word::of_reason(how, reason));
         }
-    }
-}
-
-/// Address and thread of a page: the ordinary scheduler, not the loop's.
-pub(super) fn config(at: ViewAddress, film: Option<Film>) -> ServerConfig {
-    ServerConfig {
-        address: at.address,
-        beyond_this_machine: at.beyond_this_machine,
-        on_thread: Some(Arc::new(beside_the_loop)),
-        film,
     }
 }
 

@@ -3,12 +3,13 @@
 use super::cycle::cycle_row;
 use super::hello::{Page, hello_of};
 use super::last_word;
-use super::live_view::{ViewAddress, config, film_of};
+use super::live_view::film_of;
+use super::served::{Server, ViewAddress, serve};
 use super::watcher::Watcher;
 use crate::clips;
 use crate::failure::Failure;
 use crate::recorded;
-use cellpos_live::{Banner, EventLine, Feed, Server};
+use cellpos_live::{Banner, EventLine, Feed};
 use cellpos_record::{CYCLES_CSV, Event, Follow, RunEnd, Sessions};
 use cellpos_runtime::{Statistics, TickFlags, TickRecord};
 use cellpos_script::{AtRest, CycleRow, read_cycles};
@@ -77,9 +78,7 @@ impl Watch {
         let adaptation_at = hello.adaptation_at;
         let (feed, hub) = Feed::new(hello);
         let of = session.clone();
-        let config = config(at, Some(Arc::new(move |name| film_of(&of, name))));
-        let server = Server::start(&config, hub, |_| ())
-            .map_err(|error| Failure::bad_input(error, "127.0.0.1:0 takes any free port"))?;
+        let server = serve(at, Arc::new(move |name| film_of(&of, name)), hub, |_| ())?;
         Ok(Self {
             server,
             watcher: Watcher::new(vec![feed]).with_adaptation(adaptation_at),

@@ -6,8 +6,7 @@ mod rtdc;
 
 pub use rtdc::write_rtdc;
 
-use super::columns::{Column, Row, Value, word};
-use super::parquet::listed;
+use super::columns::{Column, Row, Value, listed, word};
 use super::{Exported, Selection, Source, part_of, settle};
 use crate::error::RecordError;
 use crate::events::Event;
