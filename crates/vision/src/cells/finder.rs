@@ -12,6 +12,11 @@ use crate::outline::{Contrast, MAX_RAYS, Outline, Outliner};
 const SEED: f64 = 2.0;
 /// An outline less convex than this is that of two cells: two discs that touch have 0.88.
 const LEAST_SOLIDITY: f64 = 0.93;
+/// Depth of a waist (both dents together) and of a single dent, as a share of the short half axis: two discs of one radius whose
+/// middles are 0.7 radii apart have a waist of 0.13. And so many standard deviations of a point of the outline.
+const WAIST: f64 = 0.07;
+const DENT: f64 = 0.15;
+const DENT_SIGMA: f64 = 3.0;
 /// Width of a halo that belongs to the cell, px and share of the short half axis.
 const HALO: (f64, f64) = (6.0, 0.35);
 /// Largest shift of a frame that the background follows, px.
@@ -119,6 +124,12 @@ impl CellFinder {
     /// cell and until nothing moves: what the fast way is compared with.
     pub fn set_thorough(&mut self, thorough: bool) {
         self.outliner.thorough = thorough;
+    }
+
+    /// Says how far cells go while the next frames are exposed, from the start to the end of an exposure (px); noughts for a shutter
+    /// too fast to matter. The outline is that at mid-exposure.
+    pub fn expect_smear(&mut self, way_px: (f64, f64)) {
+        self.outliner.expect_smear(way_px);
     }
 
     /// Takes a frame without a cell into the background (running mean over all such frames).
@@ -334,12 +345,28 @@ impl CellFinder {
     }
 }
 
+/// Whether the outline is that of two objects in one.
+fn is_of_two(outline: &Outline) -> bool {
+    let sd = DENT_SIGMA * outline.point_variance.sqrt();
+    let short_px = short_half_axis_px(outline);
+    let [deepest, second] = outline.dents_px;
+    outline.solidity < LEAST_SOLIDITY
+        || deepest > DENT * short_px + sd
+        || second > 0.25 * deepest && deepest + second > WAIST * short_px + sd
+}
+
+/// Short half axis of the ellipse with the outline's moments, px.
+fn short_half_axis_px(outline: &Outline) -> f64 {
+    let [xx, xy, yy] = outline.moments_px2;
+    let (mean, half) = (0.5 * (xx + yy), 0.5 * f64::hypot(xx - yy, 2.0 * xy));
+    2.0 * (mean - half).max(1.0).sqrt()
+}
+
 /// Area of what stands out strongly beyond the outline and its halo, px.
 fn beside(regions: &Regions, blob: &Blob, part: &Part, outline: &Outline, strong: f32) -> f64 {
     let [xx, xy, yy] = outline.moments_px2;
     let determinant = (xx * yy - xy * xy).max(1e-9);
-    let (mean, half) = (0.5 * (xx + yy), 0.5 * f64::hypot(xx - yy, 2.0 * xy));
-    let short_px = 2.0 * (mean - half).max(1.0).sqrt();
+    let short_px = short_half_axis_px(outline);
     let reach = 1.0 + HALO.0 / short_px + HALO.1;
     regions.area_where(blob, strong, |x, y| {
         let (dx, dy) = (x - outline.x_px, y - outline.y_px);
@@ -368,6 +395,6 @@ fn cell(blob: &Blob, outline: &Outline, beside_px: f64, noise: f64) -> Cell {
         peak_grey: blob.peak.max(0.0).sqrt(),
         snr: outline.rim_grey.abs() / noise,
         at_border: outline.at_border,
-        in_contact: outline.solidity < LEAST_SOLIDITY || beside_px > MOST_BESIDE * outline.area_px,
+        in_contact: is_of_two(outline) || beside_px > MOST_BESIDE * outline.area_px,
     }
 }

@@ -1,6 +1,6 @@
 //! What the contour encloses, and how well that is known.
 
-use super::{BORDER_PX, Contrast, Outline, Outliner, Profile};
+use super::{BORDER_PX, Contrast, Outline, Outliner, normals};
 
 /// Share of a disc's second moments that an outline's have at least.
 const LEAST_MOMENT: f64 = 0.05;
@@ -41,7 +41,6 @@ impl Outliner {
     pub(super) fn measure(
         &mut self,
         contrast: &Contrast,
-        profile: &Profile,
         variance: f64,
         (rim_grey, halo_grey): (f64, f64),
     ) -> Option<Outline> {
@@ -80,24 +79,42 @@ impl Outliner {
         }
         let area_px = bows * area;
         let (x_px, y_px) = (x0 + mx, y0 + my);
-        let information = profile.information();
+        let mut information = [0.0; normals::WAYS + 1];
+        for (known, profile) in information.iter_mut().zip(&self.smear.profiles) {
+            *known = profile.information();
+        }
         let mut c = [0.0; 6];
-        let (mut place, mut area_variance) = ([0.0; 3], 0.0);
+        // Integrals along the contour, of 1 and of what a point adds to the moments.
+        let mut around = [0.0; 4];
+        let (mut place, mut area_variance, mut point_variance) = ([0.0; 3], 0.0, 0.0);
         for i in 0..n {
             let (a, b) = (self.points[(i + n - 1) % n], self.points[(i + 1) % n]);
             let length = 0.5 * f64::hypot(b.0 - a.0, b.1 - a.1);
             let amplitude = self.amplitudes[i];
-            let each = length * variance / (information * amplitude * amplitude);
+            let which = self.normals.get(i).map_or(0, |n| self.smear.which(n));
+            let each = length * variance / (information[which] * amplitude * amplitude);
             let (x, y) = (self.points[i].0 - x_px, self.points[i].1 - y_px);
             area_variance += each;
+            point_variance += each / (length * length).max(1e-9);
             place[0] += each * x * x;
             place[1] += each * y * y;
             place[2] += each * x * y;
             let m = [x * x - moments[0], x * y - moments[1], y * y - moments[2]];
+            for (sum, m) in around.iter_mut().zip([1.0, m[0], m[1], m[2]]) {
+                *sum += length * m;
+            }
             let pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
             for (sum, (i, j)) in c.iter_mut().zip(pairs) {
                 *sum += each * m[i] * m[j];
             }
+        }
+        let hull_area = self.hull_area();
+        // What the smear of a round edge leaves to all points alike.
+        let left_px = self.smear.left_px((area_px / core::f64::consts::PI).sqrt());
+        area_variance += (left_px * around[0]).powi(2);
+        let pairs = [(1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3)];
+        for (sum, (i, j)) in c.iter_mut().zip(pairs) {
+            *sum += left_px * left_px * around[i] * around[j];
         }
         let over = 1.0 / (area_px * area_px);
         let (width, height) = (contrast.width as f64, contrast.height as f64);
@@ -117,9 +134,48 @@ impl Outliner {
             moment_variances: c.map(|v| v * over),
             rim_grey,
             halo_grey,
-            solidity: (area / self.hull_area()).min(1.0),
+            solidity: (area / hull_area).min(1.0),
+            dents_px: self.dents_px(),
+            point_variance: point_variance / n as f64,
             at_border,
         })
+    }
+
+    /// Depths of the two deepest dents below the convex hull that was laid last, px.
+    fn dents_px(&self) -> [f64; 2] {
+        let (n, edges) = (self.points.len(), self.hull.len());
+        let mut deepest = [0.0_f64; 2];
+        let Some(first) = self.hull.first() else {
+            return deepest;
+        };
+        let Some(start) = self.points.iter().position(|p| p == first) else {
+            return deepest;
+        };
+        // Contour and hull go round in the same sense.
+        let (mut edge, mut depth) = (0, 0.0_f64);
+        for k in 1..=n {
+            let at = |k: usize| self.points[(start + k) % n];
+            let (a, b) = (self.hull[edge % edges], self.hull[(edge + 1) % edges]);
+            if at(k) == b {
+                let [most, second] = &mut deepest;
+                if depth > *most {
+                    (*most, *second) = (depth, *most);
+                } else if depth > *second {
+                    *second = depth;
+                }
+                (edge, depth) = (edge + 1, 0.0);
+                continue;
+            }
+            let (before, own, next) = (at(k + n - 1), at(k), at(k + 1));
+            let mean = |a: f64, b: f64, c: f64| 0.25 * (a + c) + 0.5 * b;
+            let (x, y) = (
+                mean(before.0, own.0, next.0) - a.0,
+                mean(before.1, own.1, next.1) - a.1,
+            );
+            let (tx, ty) = (b.0 - a.0, b.1 - a.1);
+            depth = depth.max((tx * y - ty * x) / f64::hypot(tx, ty).max(1e-9));
+        }
+        deepest
     }
 
     /// Area of the contour's convex hull (Andrew's monotone chain).

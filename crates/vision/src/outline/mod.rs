@@ -11,8 +11,6 @@ mod edge;
 mod measure;
 mod normals;
 
-use normals::Profile;
-
 /// Most rays.
 pub(crate) const MAX_RAYS: usize = 128;
 /// Fewest rays.
@@ -144,6 +142,10 @@ pub(crate) struct Outline {
     pub halo_grey: f64,
     /// Area over that of the convex hull.
     pub solidity: f64,
+    /// Depths of the two deepest dents below the convex hull, px.
+    pub dents_px: [f64; 2],
+    /// Variance of a point of the contour along its normal, px^2.
+    pub point_variance: f64,
     pub at_border: bool,
 }
 
@@ -167,6 +169,7 @@ pub(crate) struct Outliner {
     hull: Vec<(f64, f64)>,
     sorted: Vec<(f64, f64)>,
     shapes: edge::Shapes,
+    smear: normals::Smear,
 }
 
 impl Outliner {
@@ -186,7 +189,13 @@ impl Outliner {
             hull: Vec::with_capacity(2 * MAX_RAYS + 2),
             sorted: Vec::with_capacity(MAX_RAYS),
             shapes: edge::Shapes::new(),
+            smear: normals::Smear::new(),
         }
+    }
+
+    /// Says how far the cells of the next frames go while these are exposed, px.
+    pub(crate) fn expect_smear(&mut self, way_px: (f64, f64)) {
+        self.smear.way_px = way_px;
     }
 
     /// Points of the last outline, px.
@@ -228,12 +237,8 @@ impl Outliner {
         let edge = profile.edge(self.radius_px(), &self.shapes, trust)?;
         self.find_normals();
         self.shift_outwards(edge.at_px);
-        let residual = self.residual(&profile).max(noise * noise);
-        self.measure(
-            contrast,
-            &profile,
-            residual,
-            (edge.rim_grey, edge.halo_grey),
-        )
+        let residual = self.residual().max(noise * noise);
+        self.shift_by_smear();
+        self.measure(contrast, residual, (edge.rim_grey, edge.halo_grey))
     }
 }

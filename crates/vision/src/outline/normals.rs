@@ -22,6 +22,75 @@ pub(super) struct Profile {
     pub(super) half: usize,
     /// 1 for a dark rim: outside is brighter.
     pub(super) polarity: f64,
+    /// Steps that the edge is wider on either side than rim and halo say: of a profile that is smeared.
+    wider: usize,
+}
+
+/// Ways along a normal that are told apart when a cell is smeared.
+pub(super) const WAYS: usize = 8;
+/// A way over which a cell is smeared that is none, px: it widens an edge by a twelfth of its square.
+const LEAST_SMEAR_PX: f64 = 1.0;
+/// Rounds in which the mean profile is freed of the smear.
+const SHARPENED: usize = 6;
+/// Neighbours over which the contour's curvature is taken, points on either side.
+const CURVED: usize = 4;
+
+/// The mean profile as it is smeared along normals that make more or less of an angle with the motion.
+#[derive(Debug, Clone)]
+pub(super) struct Smear {
+    /// Way of the cell during the exposure, px.
+    pub(super) way_px: (f64, f64),
+    /// The mean profile along normals that stand across the motion, smeared over none of the way up to all of it.
+    pub(super) profiles: Vec<Profile>,
+}
+
+impl Smear {
+    pub(super) fn new() -> Self {
+        Smear {
+            way_px: (0.0, 0.0),
+            profiles: Vec::with_capacity(WAYS + 1),
+        }
+    }
+
+    fn length_px(&self) -> f64 {
+        let length_px = f64::hypot(self.way_px.0, self.way_px.1);
+        // The comparison also turns away what is not a number.
+        if length_px > LEAST_SMEAR_PX && length_px < MAX_FINE as f64 {
+            length_px
+        } else {
+            0.0
+        }
+    }
+
+    /// Standard deviation of what the smear of an object of a radius moves its contour by, px: the edge recedes by up to a 24th of the
+    /// squared way over the radius, which the model makes good to first order; so much again and half of it is left.
+    pub(super) fn left_px(&self, radius_px: f64) -> f64 {
+        self.length_px().powi(2) / (16.0 * radius_px.max(1.0))
+    }
+
+    /// Which of the profiles is that along a normal.
+    pub(super) fn which(&self, normal: &(f64, f64)) -> usize {
+        let length_px = self.length_px();
+        if length_px <= 0.0 {
+            return 0;
+        }
+        let along = (self.way_px.0 * normal.0 + self.way_px.1 * normal.1).abs();
+        ((along / length_px * WAYS as f64).round() as usize).min(WAYS)
+    }
+
+    /// Takes the mean profile for each angle.
+    fn spread(&mut self, profile: &Profile) {
+        let length_px = self.length_px();
+        self.profiles.clear();
+        self.profiles.push(*profile);
+        if length_px <= 0.0 {
+            return;
+        }
+        for k in 1..=WAYS {
+            let px = length_px * k as f64 / WAYS as f64;
+            self.profiles.push(profile.smeared(px));
+        }
+    }
 }
 
 impl Outliner {
@@ -56,9 +125,13 @@ impl Outliner {
     /// Mean profile, and each normal's shift against it by least squares beside amplitude and offset, into `shifts`.
     pub(super) fn align(&mut self, half: usize, polarity: f64) -> Option<Profile> {
         let profile = self.mean(half, polarity);
-        let fit = profile.least_squares();
+        let mut fits = [const { None }; WAYS + 1];
+        for (fit, profile) in fits.iter_mut().zip(&self.smear.profiles) {
+            *fit = profile.least_squares();
+        }
         let mut previous = 0.0;
         for i in 0..self.points.len() {
+            let which = self.normals.get(i).map_or(0, |n| self.smear.which(n));
             let (Some(values), Some(shift), Some(amplitude)) = (
                 self.profiles.get(i),
                 self.shifts.get_mut(i),
@@ -66,7 +139,8 @@ impl Outliner {
             ) else {
                 break;
             };
-            let fitted = fit.as_ref().and_then(|fit| fit.of(values));
+            let fit = fits.get(which).and_then(Option::as_ref);
+            let fitted = fit.and_then(|fit: &LeastSquares| fit.of(values));
             let (found, a) = fitted.unwrap_or((previous, 1.0));
             previous = found;
             (*shift, *amplitude) = (found, a);
@@ -74,28 +148,67 @@ impl Outliner {
         Some(profile)
     }
 
-    fn mean(&self, half: usize, polarity: f64) -> Profile {
+    /// The mean profile, into `smear` as it is along each angle with the motion: that which, smeared, leaves nothing of the normals'
+    /// profiles on average (Van Cittert's iteration, which few rounds keep smooth).
+    fn mean(&mut self, half: usize, polarity: f64) -> Profile {
         let count = 2 * half + 1;
-        let mut values = [0.0; 2 * MAX_FINE + 1];
-        for row in self.profiles.iter().take(self.points.len()) {
-            for (sum, v) in values.iter_mut().zip(row).take(count) {
+        // Sums over the normals of each angle, and their numbers.
+        let mut sums = [[0.0; 2 * MAX_FINE + 1]; WAYS + 1];
+        let mut numbers = [0.0; WAYS + 1];
+        let rows = self.profiles.iter().zip(&self.normals);
+        for (row, normal) in rows.take(self.points.len()) {
+            let which = self.smear.which(normal);
+            for (sum, v) in sums[which].iter_mut().zip(row).take(count) {
                 *sum += f64::from(*v);
             }
+            numbers[which] += 1.0;
         }
-        values
-            .iter_mut()
-            .for_each(|v| *v /= self.points.len().max(1) as f64);
-        let mut slopes = [0.0; 2 * MAX_FINE + 1];
-        for (k, slope) in slopes.iter_mut().enumerate().take(count) {
-            let (a, b) = (k.saturating_sub(1), (k + 1).min(count - 1));
-            *slope = (values[b] - values[a]) / ((b - a) as f64 * FINE_PX);
+        let over = 1.0 / f64::max(numbers.iter().sum(), 1.0);
+        let mut values = [0.0; 2 * MAX_FINE + 1];
+        for sums in &sums {
+            for (value, sum) in values.iter_mut().zip(sums) {
+                *value += over * sum;
+            }
         }
-        Profile {
-            values,
-            slopes,
-            half,
-            polarity,
+        let mut profile = Profile::new(values, half, polarity, 0);
+        self.smear.spread(&profile);
+        if self.smear.profiles.len() <= 1 {
+            return profile;
         }
+        for _ in 0..SHARPENED {
+            for ((sums, number), smeared) in sums.iter().zip(numbers).zip(&self.smear.profiles) {
+                for ((value, sum), own) in values.iter_mut().zip(sums).zip(&smeared.values) {
+                    *value += over * (sum - number * own);
+                }
+            }
+            profile = Profile::new(values, half, polarity, 0);
+            self.smear.spread(&profile);
+        }
+        profile
+    }
+
+    /// Moves the points out by what a motion along the contour has taken from it: the edge of what is round recedes on either side
+    /// of the middle of the exposure.
+    pub(super) fn shift_by_smear(&mut self) {
+        let n = self.points.len();
+        if self.smear.length_px() <= 0.0 || n <= 2 * CURVED {
+            return;
+        }
+        let (x, y) = self.smear.way_px;
+        for i in 0..n {
+            let at = |k: usize| self.points[k % n];
+            let (a, b) = (at(i + n - CURVED), at(i + CURVED));
+            let normal = |k: usize| self.normals.get(k % n).copied().unwrap_or_default();
+            let (from, to) = (normal(i + n - CURVED), normal(i + CURVED));
+            let turned = f64::hypot(to.0 - from.0, to.1 - from.1);
+            let curvature = turned / f64::hypot(b.0 - a.0, b.1 - a.1).max(1.0);
+            let own = normal(i);
+            let along = x * own.1 - y * own.0;
+            if let Some(shift) = self.shifts.get_mut(i) {
+                *shift = along * along * curvature / 24.0;
+            }
+        }
+        self.shift_points();
     }
 
     /// Moves each point by its shift, smoothed with its neighbours', and says how far (RMS, px).
@@ -141,11 +254,16 @@ impl Outliner {
     }
 
     /// Mean square of what the mean profile leaves of the normals' profiles, grey^2.
-    pub(super) fn residual(&self, profile: &Profile) -> f64 {
-        let (low, high) = profile.window();
+    pub(super) fn residual(&self) -> f64 {
         let (mut sum, mut n) = (0.0, 0.0);
         let rays = self.profiles.iter().zip(&self.shifts).zip(&self.amplitudes);
-        for ((values, shift), a) in rays.take(self.points.len()) {
+        let rays = rays.zip(&self.normals).take(self.points.len());
+        for (((values, shift), a), normal) in rays {
+            let which = self.smear.which(normal);
+            let Some(profile) = self.smear.profiles.get(which) else {
+                continue;
+            };
+            let (low, high) = profile.window();
             let (mut mean, mut square) = (0.0, 0.0);
             let means = profile.values.iter().zip(&profile.slopes);
             let pairs = values.iter().zip(means).take(high + 1).skip(low);
@@ -164,10 +282,57 @@ impl Outliner {
 }
 
 impl Profile {
+    fn new(values: [f64; 2 * MAX_FINE + 1], half: usize, polarity: f64, wider: usize) -> Self {
+        let mut slopes = [0.0; 2 * MAX_FINE + 1];
+        for (k, slope) in slopes.iter_mut().enumerate().take(2 * half + 1) {
+            let (a, b) = (k.saturating_sub(1), (k + 1).min(2 * half));
+            *slope = (values[b] - values[a]) / ((b - a) as f64 * FINE_PX);
+        }
+        Profile {
+            values,
+            slopes,
+            half,
+            polarity,
+            wider,
+        }
+    }
+
+    /// The profile smeared over a way, px: the mean of it along the way. It goes on beyond its ends as it is there.
+    fn smeared(&self, px: f64) -> Self {
+        let count = 2 * self.half + 1;
+        let steps = px / FINE_PX;
+        // The integral at places between the steps.
+        let mut sums = [0.0; 2 * MAX_FINE + 2];
+        for k in 0..count {
+            sums[k + 1] = sums[k] + self.values[k];
+        }
+        let integral = |at: f64| {
+            let inside = at.clamp(0.0, count as f64);
+            let k = (inside as usize).min(count - 1);
+            let beyond = (at - inside) * self.values[if at < 0.0 { 0 } else { count - 1 }];
+            sums[k] + (inside - k as f64) * self.values[k] + beyond
+        };
+        let mut values = self.values;
+        if steps > 0.1 {
+            // A step's own width is a mean already.
+            let wide = f64::hypot(steps, 1.0);
+            for (k, value) in values.iter_mut().enumerate().take(count) {
+                let middle = k as f64 + 0.5;
+                *value = (integral(middle + 0.5 * wide) - integral(middle - 0.5 * wide)) / wide;
+            }
+        }
+        Profile::new(
+            values,
+            self.half,
+            self.polarity,
+            (0.5 * steps).ceil() as usize,
+        )
+    }
+
     /// Steps between which the edge lies: from the rim to the halo, and a little on either side.
     pub(super) fn window(&self) -> (usize, usize) {
         let (rim, halo) = (self.rim(), self.halo());
-        let margin = (1.0 / FINE_PX) as usize;
+        let margin = (1.0 / FINE_PX) as usize + self.wider;
         let low = rim.saturating_sub(margin).min(self.half - 2);
         let high = (halo + margin).min(2 * self.half).max(self.half + 2);
         (low, high)

@@ -16,6 +16,8 @@ use crate::frame::Frame;
 
 /// Largest change of the size, however long the cell was not seen, as a fraction.
 const MOST_SIZE_CHANGE: f64 = 0.4;
+/// Largest change of the surface from frame to frame, as a fraction, though the volume agrees: no cell stretches faster.
+const MOST_JUMP: f64 = 0.2;
 /// Share of a new fix in the running contrast of the body.
 const FORGETTING: f64 = 0.01;
 /// A region whose middle is within this share of the cell's width of the prediction cannot be another cell.
@@ -104,8 +106,16 @@ impl CellTracker {
         time_s: f64,
         commanded: impl Into<Commanded>,
     ) -> Result<CellStep, CellError> {
-        let flow_px_per_s = commanded.into().flow_px_per_s;
+        let Commanded {
+            flow_px_per_s,
+            streak_px,
+            exposure_s,
+        } = commanded.into();
         if let Some(frame) = frame {
+            let way_px = self
+                .chosen
+                .map_or(streak_px, |c| c.motion.way_px(streak_px, exposure_s));
+            self.finder.expect_smear(way_px);
             self.finder.find(frame)?;
             self.finder.refresh(frame);
         }
@@ -278,7 +288,8 @@ impl CellTracker {
         let allowed = (f64::from(chosen.missed.max(1)) * (1.0 + self.config.max_size_change).ln())
             .min((1.0 + MOST_SIZE_CHANGE).ln());
         let (surface, volume) = sizes(cell, &chosen.cell);
-        if surface.abs().min(volume.abs()) <= allowed {
+        let jump = f64::from(chosen.missed.max(1)) * (1.0 + MOST_JUMP).ln();
+        if surface.abs().min(volume.abs()) <= allowed && surface.abs() <= jump {
             None
         } else if surface > 0.0 {
             Some(touched(Decision::Merged))

@@ -1,6 +1,8 @@
 //! Pictures, rendered and recorded, through localiser and trackers.
 
 mod bound;
+mod cell_lab;
+mod cell_table;
 mod cells;
 mod common;
 mod detector;

@@ -159,7 +159,38 @@ impl Picture {
         upper + v * (lower - upper)
     }
 
-    fn sampled(
+    /// The same, and nothing beyond the border.
+    pub(crate) fn inside(&self, x: f64, y: f64) -> f64 {
+        let (w, h) = (self.width as f64 - 1.0, self.height as f64 - 1.0);
+        if (0.0..=w).contains(&x) && (0.0..=h).contains(&y) {
+            self.at(x, y)
+        } else {
+            0.0
+        }
+    }
+
+    /// Moved to the right and down, px.
+    pub(crate) fn moved(&self, dx: f64, dy: f64) -> Picture {
+        if (dx, dy) == (0.0, 0.0) {
+            return self.clone();
+        }
+        self.sampled(self.width, self.height, |x, y| (x - dx, y - dy))
+    }
+
+    /// The mean over a way of so many px along the rows, as an exposure smears what moves.
+    pub(crate) fn smeared(&self, px: f64) -> Picture {
+        let steps = 4 * px.ceil() as usize;
+        let mut mean = self.clone();
+        mean.grey.fill(0.0);
+        for k in 0..steps {
+            let part = self.moved(px * ((k as f64 + 0.5) / steps as f64 - 0.5), 0.0);
+            let sum = mean.grey.iter_mut().zip(&part.grey);
+            sum.for_each(|(m, v)| *m += v / steps as f64);
+        }
+        mean
+    }
+
+    pub(crate) fn sampled(
         &self,
         width: usize,
         height: usize,
@@ -182,12 +213,13 @@ impl Picture {
             .map(|k| (-0.5 * (f64::from(k) / sd).powi(2)).exp())
             .collect();
         let sum: f64 = kernel.iter().sum();
-        let along = |p: &Picture, (dx, dy): (f64, f64)| {
+        let along = |p: &Picture, (dx, dy): (i32, i32)| {
+            let last = (p.width as i32 - 1, p.height as i32 - 1);
             let value = |k: usize| {
-                let (x, y) = ((k % p.width) as f64, (k / p.width) as f64);
+                let (x, y) = ((k % p.width) as i32, (k / p.width) as i32);
                 let near = kernel.iter().zip(-reach..).map(|(w, j)| {
-                    let j = f64::from(j);
-                    w * p.at(x + j * dx, y + j * dy)
+                    let (i, j) = ((x + j * dx).clamp(0, last.0), (y + j * dy).clamp(0, last.1));
+                    w * p.grey[j as usize * p.width + i as usize]
                 });
                 near.sum::<f64>() / sum
             };
@@ -196,6 +228,6 @@ impl Picture {
                 ..p.clone()
             }
         };
-        along(&along(self, (1.0, 0.0)), (0.0, 1.0))
+        along(&along(self, (1, 0)), (0, 1))
     }
 }

@@ -1,0 +1,171 @@
+//! The table of cells: what the finder makes of overlaps, borders, blur, moved walls and motion.
+
+use crate::cell_lab::{Cut, Lab, Row, SETS, blurred, good};
+use crate::common::change::Picture;
+use cellpos_vision::Cell;
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn two_cells_that_overlap_are_not_one_good_cell() {
+    for mut lab in SETS.map(Lab::open) {
+        let cells = std::mem::take(&mut lab.cells);
+        // Distance of the middles over the mean width, and direction.
+        for apart in [0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.1, 1.4] {
+            let mut row = Row::default();
+            for (n, known) in cells.iter().enumerate() {
+                let (cut, place) = (&known.cut, lab.set.middle(&known.cut));
+                for (turn, angle) in [0.0, 0.4, 0.8, 1.6, -0.8].into_iter().enumerate() {
+                    let other = &cells[(n + turn) % cells.len()];
+                    let px = apart * (cut.half.0 + other.cut.half.0);
+                    let there = (
+                        place.0 + px * f64::cos(angle),
+                        place.1 + px * f64::sin(angle),
+                    );
+                    let (top, bottom) = (there.1 - other.cut.half.1, there.1 + other.cut.half.1);
+                    if top < 4.0 || bottom > lab.set.empty.height as f64 - 5.0 {
+                        continue;
+                    }
+                    let picture = lab.set.composed(&[
+                        (&cut.contrast, cut, place),
+                        (&other.cut.contrast, &other.cut, there),
+                    ]);
+                    let found = lab.find(&picture);
+                    row.drawn += 1;
+                    row.said += usize::from(found.iter().any(|c| c.in_contact));
+                    let ratio = |c: &Cell| c.area_px / known.alone.area_px;
+                    row.areas
+                        .extend(found.iter().filter(|c| good(c)).map(ratio));
+                    row.wrong(&found, &[(known, place), (other, there)]);
+                }
+            }
+            row.print(lab.name, &format!("overlap {apart}"));
+            // Nearer than that it is one round outline of another size, as a larger cell has.
+            let most = if apart < 0.3 {
+                usize::MAX
+            } else if apart < 0.5 {
+                row.drawn / 4
+            } else {
+                row.drawn / 20
+            };
+            assert!(row.lies <= most, "{} {apart}: {row:?}", lab.name);
+        }
+    }
+}
+
+/// Pairs of cells that nobody has looked at: drawn by chance, at any distance and in any direction.
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
+    let (mut drawn, mut alone, mut pairs, mut lies) = (0, 0, 0, 0);
+    for mut lab in SETS.map(Lab::open) {
+        let (cells, tried) = lab.varied(8);
+        println!(
+            "{}: {} of {tried} alone are one good cell",
+            lab.name,
+            cells.len()
+        );
+        drawn += tried;
+        alone += cells.len();
+        let mut rows: [Row; 4] = Default::default();
+        for _ in 0..400 {
+            let mut one_of = |n: usize| (lab.random.uniform() * n as f64) as usize;
+            let (known, other) = (&cells[one_of(cells.len())], &cells[one_of(cells.len())]);
+            let apart = 0.35 + lab.random.uniform();
+            let angle = std::f64::consts::TAU * lab.random.uniform();
+            let place = lab.set.middle(&known.cut);
+            // Along the ellipse about both boxes.
+            let there = (
+                place.0 + apart * (known.cut.half.0 + other.cut.half.0) * angle.cos(),
+                place.1 + apart * (known.cut.half.1 + other.cut.half.1) * angle.sin(),
+            );
+            let half = other.cut.half.1;
+            if there.1 - half < 4.0 || there.1 + half > lab.set.empty.height as f64 - 5.0 {
+                continue;
+            }
+            let picture = lab.set.composed(&[
+                (&known.cut.contrast, &known.cut, place),
+                (&other.cut.contrast, &other.cut, there),
+            ]);
+            let found = lab.find(&picture);
+            let row = &mut rows[((apart - 0.35) * 4.0) as usize];
+            row.drawn += 1;
+            row.said += usize::from(found.iter().any(|c| c.in_contact));
+            let ratio = |c: &Cell| c.area_px / known.alone.area_px;
+            row.areas
+                .extend(found.iter().filter(|c| good(c)).map(ratio));
+            row.wrong(&found, &[(known, place), (other, there)]);
+        }
+        for (row, apart) in
+            rows.iter_mut()
+                .zip(["0.35 to 0.6", "0.6 to 0.85", "0.85 to 1.1", "1.1 to 1.35"])
+        {
+            row.print(lab.name, &format!("pairs {apart}"));
+            pairs += row.drawn;
+            lies += row.lies;
+        }
+    }
+    println!("{alone} of {drawn} alone, {lies} lies of {pairs} pairs");
+    assert!(alone * 100 >= drawn * 95, "{alone} of {drawn}");
+    assert!(lies * 20 <= pairs, "{lies} of {pairs}");
+}
+
+#[test]
+#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
+fn changed_cells() {
+    let still = |_: &Cut, p: (f64, f64)| [p, p];
+    for mut lab in SETS.map(Lab::open) {
+        for px in [1.0, 2.0, 4.0, 6.0] {
+            let what = format!("cell out of focus {px}");
+            lab.row(&what, |c| blurred(c, px), |p| p, still);
+        }
+        for px in [3.0, 6.0, 10.0] {
+            let what = format!("smeared {px} px");
+            lab.row(&what, |c| c.smeared(px), |p| p, still);
+            lab.finder.expect_smear((px, 0.0));
+            let what = format!("smeared {px} px, told");
+            let row = lab.row(&what, |c| c.smeared(px), |p| p, still);
+            if px < 8.0 {
+                let middle = row.areas[row.areas.len() / 2];
+                let off = row.sigmas[row.sigmas.len() / 2];
+                // A bead of 9 px that goes two thirds of its radius is told to 5 %, and says so.
+                let most = if lab.name == "calibration-beads" {
+                    0.06
+                } else {
+                    0.02
+                };
+                assert!(
+                    (middle - 1.0).abs() < most && off < 3.0,
+                    "{} {what}: {row:?}",
+                    lab.name
+                );
+                assert_eq!(row.areas.len(), row.drawn, "{} {what}", lab.name);
+            }
+            lab.finder.expect_smear((0.0, 0.0));
+        }
+        // Px beyond the border, and widths.
+        for (px, widths) in [(-4.0, 0.0), (1.0, 0.0), (4.0, 0.0), (0.0, 0.5), (0.0, 0.8)] {
+            let what = format!("beyond the border {px} px, {widths} widths");
+            let row = lab.row(
+                &what,
+                Picture::clone,
+                |p| p,
+                |cut, (_, y)| {
+                    let x = (1.0 - 2.0 * widths) * cut.half.0 - 0.5 - px;
+                    [(x, y); 2]
+                },
+            );
+            // One of nine is laid just inside of the border that cuts it.
+            let (least, most) = if px < 0.0 {
+                (row.drawn, row.drawn)
+            } else {
+                (0, 1)
+            };
+            let good = row.areas.len();
+            assert!(
+                good >= least && good <= most,
+                "{} {what}: {row:?}",
+                lab.name
+            );
+        }
+    }
+}
