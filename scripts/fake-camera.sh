@@ -25,5 +25,5 @@ fi
 # The fake camera sleeps for 100 ms whenever it is a millisecond late: real-time priority keeps it from being late.
 fifo=()
 if chrt -f 20 true 2>/dev/null; then fifo=(chrt -f 20); else echo "no real-time priority: expect stalls of 100 ms"; fi
-cargo test --release -p cellpos-drivers --features aravis --test all fake_camera --no-run
-"${fifo[@]}" cargo test --release -p cellpos-drivers --features aravis --test all fake_camera -- --ignored --nocapture --test-threads 1
+cargo test --locked -p cellpos-drivers --features aravis --test all fake_camera --no-run
+"${fifo[@]}" cargo test --locked -p cellpos-drivers --features aravis --test all fake_camera -- --ignored --nocapture --test-threads 1

