@@ -195,7 +195,7 @@ fn a_bead_drawn_into_the_stream_is_tracked_and_its_frames_are_stamped_with_the_t
         coast_limit_s: 0.3,
         ..TrackerConfig::default()
     };
-    let mut tracker = Tracker::new(localiser, config.clone()).unwrap();
+    let mut tracker = Tracker::new(localiser, config).unwrap();
     let mut buffer = FrameBuffer::default();
     let mut states = [0_u32; 4];
     let (mut squares, mut fixes, mut longest_ms, mut last_ns) = (0.0, 0_u32, 0.0_f64, None::<i64>);
