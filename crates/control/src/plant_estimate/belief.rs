@@ -40,6 +40,8 @@ const fn grid() -> [f64; GAINS] {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Likelihood {
     best: f64,
+    information: f64,
+    /// The same of a cell.
     precision: f64,
     /// Logarithm at its best gain.
     height: f64,
@@ -55,6 +57,7 @@ impl Likelihood {
         let width = (RATIO - 1.0) * best.clamp(GRID[0], GRID[GAINS - 1]);
         Self {
             best,
+            information,
             // The gain is anywhere in its cell.
             precision: information / (1.0 + information * width * width / 12.0),
             height: 0.5 * score * best,
@@ -154,28 +157,82 @@ impl Marginal {
         .normal()
     }
 
-    fn finding(&self) -> Finding {
-        let moments = |p: &[f64], value: &dyn Fn(usize) -> f64| {
-            let all: f64 = p.iter().sum();
-            let mean = |of: &dyn Fn(usize) -> f64| {
-                p.iter().enumerate().map(|(i, p)| p * of(i)).sum::<f64>() / all
+    /// With the cells near the likely gain replaced by its normal distribution, which the grid is too coarse for.
+    fn finding(&self, likely: &Likely) -> Finding {
+        let near = likely.near(self);
+        let far = |k: usize| !likely.is_near(k);
+        let moments = |at: f64, variance: f64, value: &dyn Fn(usize) -> f64| {
+            let cells = || {
+                (0..GAINS)
+                    .filter(|k| far(*k))
+                    .map(|k| (self.gains[k], value(k)))
             };
-            let at = mean(value);
-            (at, mean(&|i| (value(i) - at).powi(2)))
+            let mean = near * at + cells().map(|(p, x)| p * x).sum::<f64>();
+            let square = |x: f64| (x - mean).powi(2);
+            let spread = cells().map(|(p, x)| p * square(x)).sum::<f64>();
+            (mean, near * (variance + square(at)) + spread)
         };
-        let cell = |width: f64| width * width / 12.0;
-        let (gain, gain2) = moments(&self.gains, &|k| GRID[k]);
-        let (log_gain, log2) = moments(&self.gains, &log_at);
-        let (delay, delay2) = moments(&self.delays, &|d| FIRST + STEP * d as f64);
+        let Likely { gain, variance } = *likely;
+        let (mean, gain2) = moments(gain, variance, &|k| GRID[k]);
+        let (log_gain, log2) = moments(gain.ln(), variance / (gain * gain), &log_at);
+        let delay_at = |d: usize| FIRST + STEP * d as f64;
+        let delays = || self.delays.iter().enumerate();
+        let delay: f64 = delays().map(|(d, p)| p * delay_at(d)).sum();
+        let delay2: f64 = delays()
+            .map(|(d, p)| p * (delay_at(d) - delay).powi(2))
+            .sum();
         Finding {
-            gain,
-            gain_sd: gain2.max(cell((RATIO - 1.0) * gain)).sqrt(),
+            gain: mean,
+            gain_sd: gain2.sqrt(),
             log_gain,
-            log_sd: log2.max(cell(RATIO.ln())).sqrt(),
+            log_sd: log2.sqrt(),
             delay,
-            delay_sd: delay2.max(cell(STEP)).sqrt(),
+            // The delay is anywhere in its cell.
+            delay_sd: delay2.max(STEP * STEP / 12.0).sqrt(),
             marginal: *self,
         }
+    }
+}
+
+/// The gain within the cells that have most of the probability: a normal distribution. While it is wider than a cell it is that of the
+/// grid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Likely {
+    gain: f64,
+    variance: f64,
+}
+
+impl Likely {
+    /// All of a distribution.
+    fn new(cells: &Marginal) -> Self {
+        let mean = |of: &dyn Fn(usize) -> f64| (0..GAINS).map(|k| cells.gains[k] * of(k)).sum();
+        let gain: f64 = mean(&|k| GRID[k]);
+        let variance = mean(&|k| (GRID[k] - gain).powi(2));
+        Self { gain, variance }
+    }
+
+    /// A block of fixes over this time.
+    fn observe(&mut self, block: &Likelihood, seconds: f64) {
+        self.variance += (GAIN_WALK * self.gain).powi(2) * seconds;
+        let part = self.variance * block.information / (1.0 + self.variance * block.information);
+        let gain = self.gain + part * (block.best - self.gain);
+        self.gain = gain.clamp(GRID[0], GRID[GAINS - 1]);
+        self.variance *= 1.0 - part;
+    }
+
+    fn is_wide(&self) -> bool {
+        self.variance.sqrt() > (RATIO - 1.0) * self.gain
+    }
+
+    /// Whether a cell is that of the gain, or within three standard deviations.
+    fn is_near(&self, k: usize) -> bool {
+        let far = (RATIO - 1.0) * self.gain + 3.0 * self.variance.sqrt();
+        self.is_wide() || (GRID[k] - self.gain).abs() < far
+    }
+
+    fn near(&self, cells: &Marginal) -> f64 {
+        let near = (0..GAINS).filter(|k| self.is_near(*k));
+        near.map(|k| cells.gains[k]).sum()
     }
 }
 
@@ -187,6 +244,7 @@ pub(super) struct Belief {
     cells: [[f64; GAINS]; DELAYS],
     before: Marginal,
     total: f64,
+    likely: Likely,
     now: Marginal,
     block: [Likelihood; DELAYS],
     most: f64,
@@ -202,6 +260,7 @@ impl Belief {
             cells: prior.delays.map(|p| prior.gains.map(|q| p * q)),
             before: prior,
             total: 1.0,
+            likely: Likely::new(&prior),
             now: NONE,
             block: [Likelihood::default(); DELAYS],
             most: 0.0,
@@ -220,6 +279,10 @@ impl Belief {
         self.most = possible.fold(f64::NEG_INFINITY, |most, (one, _)| most.max(one.most()));
         if self.most.is_finite() {
             (self.block, self.seconds, self.row, self.now) = (block, seconds, 0, NONE);
+            let delays = self.before.delays.iter().zip(&block);
+            if let Some((_, block)) = delays.max_by(|a, b| a.0.total_cmp(b.0)) {
+                self.likely.observe(block, seconds);
+            }
         }
     }
 
@@ -255,7 +318,10 @@ impl Belief {
             return None;
         }
         self.before = self.now.normal();
-        Some(self.before.finding())
+        if self.likely.is_wide() || self.likely.near(&self.before) < 0.5 {
+            self.likely = Likely::new(&self.before);
+        }
+        Some(self.before.finding(&self.likely))
     }
 
     fn least(&self) -> f64 {

@@ -42,8 +42,10 @@ const SETTLE_TICKS: f64 = 1500.0;
 /// Largest change per tick of the logarithm of the gain in force, upwards and downwards.
 const UP_PER_TICK: f64 = 0.15;
 const DOWN_PER_TICK: f64 = 0.001;
-/// Logarithm of the odds that makes a delay longer, and shorter. A change that is reported must be as sure as the latter.
-const DELAY_SURE: [f64; 2] = [3.0, 8.0];
+/// Logarithm of the odds by which a delay in force is too short, or too long: it is outside a 95 % interval.
+const DELAY_SURE: f64 = 3.66;
+/// Logarithm of the odds of a change that is reported: one of 3000 is false if the noise is as it is measured.
+const REPORT_SURE: f64 = 8.0;
 /// Ticks between two changes of the delay.
 const DELAY_TICKS: u16 = 20;
 /// A change of the gain that is reported, by its logarithm. The tuning, and a standard deviation of the estimate, must first be within half
@@ -169,9 +171,9 @@ impl Retuning {
 
     fn follow_delay(&mut self, found: &Finding, usable: &[bool; TUNINGS]) -> DelayStep {
         let [longer, shorter] = found.delay_odds(DELAYS[self.member]);
-        let next = if longer > DELAY_SURE[0] {
+        let next = if longer > DELAY_SURE {
             self.member + 1
-        } else if shorter > DELAY_SURE[1] {
+        } else if shorter > DELAY_SURE {
             self.member.wrapping_sub(1)
         } else {
             return DelayStep::None;
@@ -204,12 +206,12 @@ impl Retuning {
         }
         let farther = 0.5 * REPORTED_GAIN + INTERVAL * before.log_sd;
         let gain = (found.log_gain - before.log_gain).abs() > REPORTED_GAIN
-            && found.gain_odds(before.log_gain, farther) > DELAY_SURE[1];
-        let surely = |member: usize| {
+            && found.gain_odds(before.log_gain, farther) > REPORT_SURE;
+        let surely_not = |member: usize, sure: f64| {
             let [longer, shorter] = found.delay_odds(DELAYS[member]);
-            longer.max(shorter) > DELAY_SURE[1]
+            longer.max(shorter) > sure
         };
-        let delay = surely(before.member) && !surely(self.member);
+        let delay = surely_not(before.member, REPORT_SURE) && !surely_not(self.member, DELAY_SURE);
         if !(gain || delay) {
             return None;
         }
