@@ -2,6 +2,7 @@
 
 use crate::bench::Bench;
 use crate::capture::Capture;
+use crate::rig_text::change;
 use crate::sight::Sight;
 use crate::snapshot::{Seen, mark, picture};
 use cellpos_rig::FrameBuffer;
@@ -164,27 +165,12 @@ fn sheet(frames: &[&FrameBuffer], config: Option<&LocaliserConfig>) -> Result<Rg
 /// # Errors
 /// The file cannot be read or written, or is no TOML.
 pub fn write_vision(rig: &Path, vision: &LocaliserConfig) -> Result<bool, Failure> {
-    let refused = |error: &dyn std::fmt::Display| {
-        Failure::bad_input(
-            format!("{}: [vision] cannot be written: {error}", rig.display()),
-            "the settings are in the output: paste them; or make the file writable",
-        )
-    };
-    let text = std::fs::read_to_string(rig).map_err(|error| refused(&error))?;
-    let (text, replaced) = with_vision(&text, vision).map_err(|error| refused(&error))?;
-    // Whoever reads the file meanwhile finds one or the other, whole. A link stays one.
-    let path = rig.canonicalize().map_err(|error| refused(&error))?;
-    let unfinished = path.with_extension("toml.part");
-    std::fs::write(&unfinished, text)
-        .and_then(|()| std::fs::rename(&unfinished, &path))
-        .map_err(|error| refused(&error))?;
-    Ok(replaced)
+    change(rig, "[vision]", |document| set(document, vision))
 }
 
-/// The text of a rig file with another table `[vision]`.
-fn with_vision(text: &str, vision: &LocaliserConfig) -> Result<(String, bool), String> {
+/// Gives the text of a rig file another table `[vision]`. True if there was one.
+fn set(document: &mut DocumentMut, vision: &LocaliserConfig) -> Result<bool, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
-    let mut document: DocumentMut = text.parse().map_err(|error| words(&error))?;
     let new: DocumentMut = toml::to_string(vision)
         .map_err(|error| words(&error))?
         .parse()
@@ -212,7 +198,7 @@ fn with_vision(text: &str, vision: &LocaliserConfig) -> Result<(String, bool), S
         table.insert(key, Item::Value(value));
     }
     document.insert("vision", Item::Table(table));
-    Ok((document.to_string(), replaced))
+    Ok(replaced)
 }
 
 #[cfg(test)]
@@ -220,6 +206,12 @@ mod tests {
     use super::*;
     use cellpos_session::RigFile;
     use cellpos_vision::{Polarity, ProfileSpec};
+
+    fn with_vision(text: &str, vision: &LocaliserConfig) -> Result<(String, bool), String> {
+        let mut document: DocumentMut = text.parse().expect("TOML");
+        let replaced = set(&mut document, vision)?;
+        Ok((document.to_string(), replaced))
+    }
 
     const RIG: &str = "# my rig\nfirst_neutral = \"20um\"   # believed\n\n[actuator]\nkind = \"emulated\"\n\n# what it looks like\n\
         [vision]                 # found by hand\nwindow_px = 21   # odd\nprofile = { kind = \"ring\", edge_px = 5.0 }\n\

@@ -7,14 +7,17 @@
 
 use crate::bench::Bench;
 use crate::mover::Mover;
+use crate::rig_text::change;
 use crate::watch::{Sighting, Watch};
 use cellpos_drivers::{Axis, CalibrationFile};
 use cellpos_rig::Clock;
 use cellpos_runtime::realtime;
 use cellpos_session::Failure;
 use serde::Serialize;
+use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
+use toml_edit::value;
 
 /// Pulses: how far, how long, how many.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -323,6 +326,26 @@ fn regress(
     (residual, response)
 }
 
+/// Names a calibration file in a rig file, in place of a table `[calibration]` or of another file. Beside the rig file by its name
+/// alone, so that both can be moved; elsewhere by its whole path.
+///
+/// # Errors
+/// One of them cannot be read, or the rig file cannot be written.
+pub fn name_in_rig(rig: &Path, calibration: &Path) -> Result<(), Failure> {
+    let whole = |path: &Path| path.canonicalize().map_err(Failure::failed);
+    let (rig_at, at) = (whole(rig)?, whole(calibration)?);
+    let name = match at.file_name() {
+        Some(name) if at.parent() == rig_at.parent() => Path::new(name),
+        _ => at.as_path(),
+    };
+    let name = name.to_string_lossy().into_owned();
+    change(rig, "calibration_file", |document| {
+        document.remove("calibration");
+        document["calibration_file"] = value(name);
+        Ok(())
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -365,6 +388,33 @@ mod tests {
         assert!((response.lag_ms - 2.0).abs() < 1e-9, "{response:?}");
         let file = response.calibration(0.1, 0.001, "test".to_string());
         assert_eq!((file.axis, file.sign, file.origin_px), (Axis::X, -1, 127.5));
+    }
+
+    #[test]
+    fn a_rig_file_names_its_calibration_and_keeps_every_comment_elsewhere() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (rig, other) = (folder.path().join("rig.toml"), folder.path().join("other"));
+        std::fs::create_dir(&other).expect("a folder");
+        let text = "# my rig\n[camera]           # mine\nkind = \"emulated\"\n\n[calibration]      # a guess\npixel = \"0.1um\"\n\n\
+                    [limits]           # of the command\npark = \"20um\"\n";
+        std::fs::write(&rig, text).expect("written");
+        for place in [folder.path(), &other, folder.path()] {
+            let file = place.join("calibration.toml");
+            std::fs::write(
+                &file,
+                "pixel_um = 0.11\npixel_um_sd = 0.001\naxis = \"x\"\nsign = 1\norigin_px = 100.5\ndate = \"2026-11-25\"\nmethod = \"test\"\n",
+            )
+            .expect("written");
+            name_in_rig(&rig, &file).expect("named");
+            let new = std::fs::read_to_string(&rig).expect("there");
+            for kept in ["# my rig", "# mine", "# of the command"] {
+                assert!(new.contains(kept), "lost {kept:?} in\n{new}");
+            }
+            assert!(!new.contains("[calibration]") && new.matches("calibration_file").count() == 1);
+            let read = cellpos_session::RigFile::load(Some(&rig));
+            let read = read.unwrap_or_else(|error| panic!("{error:?}\n{new}"));
+            assert_eq!(read.calibration.expect("named").pixel_um, 0.11);
+        }
     }
 
     #[test]

@@ -31,6 +31,7 @@ pub mod line_test;
 pub mod mover;
 pub mod partner;
 pub mod prove;
+mod rig_text;
 pub mod sight;
 pub mod snapshot;
 pub mod template;

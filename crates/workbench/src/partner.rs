@@ -1,5 +1,6 @@
 //! What was measured of the slow actuator, written into the table `[partner]` of a rig file.
 
+use crate::rig_text::change;
 use cellpos_session::Failure;
 use std::path::Path;
 use toml_edit::{DocumentMut, value};
@@ -9,26 +10,10 @@ use toml_edit::{DocumentMut, value};
 /// # Errors
 /// The file cannot be read or written, or has no such table.
 pub fn write_partner(rig: &Path, keys: &[(&str, f64)]) -> Result<(), Failure> {
-    let refused = |error: &dyn std::fmt::Display| {
-        Failure::bad_input(
-            format!("{}: [partner] cannot be written: {error}", rig.display()),
-            "the values are in the output: paste them; or make the file writable",
-        )
-    };
-    let text = std::fs::read_to_string(rig).map_err(|error| refused(&error))?;
-    let text = with_keys(&text, keys).map_err(|error| refused(&error))?;
-    // Whoever reads the file meanwhile finds one or the other, whole. A link stays one.
-    let path = rig.canonicalize().map_err(|error| refused(&error))?;
-    let unfinished = path.with_extension("toml.part");
-    std::fs::write(&unfinished, text)
-        .and_then(|()| std::fs::rename(&unfinished, &path))
-        .map_err(|error| refused(&error))
+    change(rig, "[partner]", |document| set(document, keys))
 }
 
-fn with_keys(text: &str, keys: &[(&str, f64)]) -> Result<String, String> {
-    let mut document: DocumentMut = text
-        .parse()
-        .map_err(|error: toml_edit::TomlError| error.to_string())?;
+fn set(document: &mut DocumentMut, keys: &[(&str, f64)]) -> Result<(), String> {
     let table = document
         .get_mut("partner")
         .and_then(|item| item.as_table_like_mut())
@@ -43,12 +28,17 @@ fn with_keys(text: &str, keys: &[(&str, f64)]) -> Result<String, String> {
         }
         table.insert(key, value(*number));
     }
-    Ok(document.to_string())
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn with_keys(text: &str, keys: &[(&str, f64)]) -> Result<String, String> {
+        let mut document: DocumentMut = text.parse().expect("TOML");
+        set(&mut document, keys).map(|()| document.to_string())
+    }
 
     #[test]
     fn keys_are_replaced_and_the_rest_stays() {

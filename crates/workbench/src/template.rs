@@ -119,7 +119,7 @@ hold_watchdog = \"2s\"     # holding time after which it parks
 
 [camera]
 {camera}
-[calibration]            # cellpos calibrate writes a better one: calibration_file = \"calibration.toml\"
+[calibration]            # cellpos calibrate replaces it by calibration_file = \"calibration.toml\"
 pixel = \"0.1um\"          # a guess, until measured with a stage micrometer
 origin_px = 127.5        # column of position 0 um
 sign = 1.0               # +1: the coordinate rises when the PZT extends

@@ -22,7 +22,7 @@ pub(crate) struct Args {
     /// Rig.
     #[arg(long)]
     rig: PathBuf,
-    /// New calibration file; name it in rig.toml with calibration_file.
+    /// New calibration file; the rig file will name it, in place of its [calibration].
     #[arg(long)]
     out: PathBuf,
     /// Picture of a stage micrometer, lines across the channel (cellpos camera --snapshot).
@@ -140,6 +140,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     );
     CalibrationFile::parse(&text, &args.out).map_err(Failure::failed)?;
     std::fs::write(&args.out, text).map_err(Failure::failed)?;
+    calibrate::name_in_rig(&args.rig, &args.out)?;
     let done = Calibrated {
         out: args.out,
         calibration,
@@ -191,7 +192,7 @@ impl std::fmt::Display for Calibrated {
         }
         writeln!(
             f,
-            "wrote   {}; in rig.toml: calibration_file = \"{0}\"",
+            "wrote   {}, which the rig file now names",
             self.out.display()
         )
     }
