@@ -35,4 +35,15 @@ impl Deviation {
         c[DEVIATION - 1] = model.feedthrough;
         Self { a, b, c }
     }
+
+    /// Motion of the bead by the next tick after a command of 1 um, um.
+    pub(crate) fn moved_um(&self) -> f64 {
+        (&self.c * &self.b)[0]
+    }
+
+    /// The motion by which a command's cost is measured, um for 1 um: that of a bare integrator in a tick, or behind a lag
+    /// the part of it that comes by the next tick. The rest comes later and costs the error, not the command.
+    pub(crate) fn costed_um(&self) -> f64 {
+        self.moved_um().abs().min(self.b[0].abs())
+    }
 }

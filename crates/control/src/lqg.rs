@@ -20,14 +20,14 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Lqg {
-    /// Weight of the motion that a command causes in a tick, relative to the position error: 0.05 is close to minimum
-    /// variance, 8 is cautious; 3 is stable for twice the gain with one more sample of delay, however exact the fixes.
+    /// Weight of the motion that a command causes by the next tick, relative to the position error: 0.05 is close to minimum
+    /// variance, 10 is cautious; 3.8 is stable for twice the gain with one more sample of delay, however exact the fixes.
     pub effort: f64,
 }
 
 impl Default for Lqg {
     fn default() -> Self {
-        Self { effort: 3.0 }
+        Self { effort: 3.8 }
     }
 }
 
@@ -47,7 +47,7 @@ impl Lqg {
     pub fn feedback(&self, model: &LoopModel) -> Result<Feedback, BuildError> {
         self.validate()?;
         let d = Deviation::new(model);
-        let weight = self.effort * d.b[0] * d.b[0];
+        let weight = self.effort * d.costed_um().powi(2);
         let (f, _) = lq_feedback(&d.a, &d.b, &(d.c.transpose() * &d.c), weight)?;
         Ok(Feedback {
             gains: std::array::from_fn(|i| f[i]),

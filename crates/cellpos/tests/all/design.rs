@@ -166,7 +166,7 @@ fn a_controller_file_is_checked_as_it_stands_and_written_for_another_delay() {
     let text = std::fs::read_to_string(here.join("lqg.toml")).unwrap();
     std::fs::write(
         here.join("bold.toml"),
-        text.replace("effort = 3.0", "effort = 0.3"),
+        text.replace("effort = 3.8", "effort = 0.3"),
     )
     .unwrap();
     let figures = |line: &str| {

@@ -50,9 +50,7 @@ pub fn bound_rms_of_path_um(diffusion_um2_per_s: f64, fix_noise_um: f64, model: 
         model.sample_time_s,
     );
     let d = Deviation::new(model);
-    // By the next tick a command of 1 um moves the bead as far.
-    let moved_um = (&d.c * &d.b)[0];
-    let weight = NEXT_TO_NONE * moved_um * moved_um;
+    let weight = NEXT_TO_NONE * d.moved_um().powi(2);
     let more = lq_feedback(&d.a, &d.b, &(d.c.transpose() * &d.c), weight)
         // Of a step of the bead one tick passes before anything can be done; the rest is what stays for longer.
         .map_or(0.0, |(_, cost)| (cost[(0, 0)] - 1.0).max(0.0));

@@ -46,8 +46,8 @@ pub struct Mpc {
 impl Default for Mpc {
     fn default() -> Self {
         Self {
-            effort: 3.0,
-            move_effort: 0.1,
+            effort: 3.8,
+            move_effort: 0.13,
             solver: SolverKind::default(),
             view_low_um: None,
             view_high_um: None,
@@ -114,7 +114,7 @@ impl Condensed {
     pub(super) fn new(mpc: &Mpc, model: &LoopModel) -> Result<Self, BuildError> {
         mpc.validate()?;
         let d = Deviation::new(model);
-        let scale = d.b[0] * d.b[0];
+        let scale = d.costed_um().powi(2);
         let (_, terminal) = lq_feedback(&d.a, &d.b, &(d.c.transpose() * &d.c), mpc.effort * scale)?;
         let ends: Vec<usize> = BLOCKS
             .iter()
