@@ -111,6 +111,11 @@ impl Path {
         self
     }
 
+    /// Displacement at which the bead rests, um; commands are counted from `mean_um`.
+    fn rest_um(&self, mean_um: f64, gain: f64) -> f64 {
+        mean_um - self.x[1] / (self.x[3] * gain)
+    }
+
     /// Adds a multiple of one state to another: x' = F x, P' = F P F^T.
     fn add(&mut self, to: usize, from: usize, factor: f64) {
         self.x[to] += factor * self.x[from];
@@ -190,6 +195,14 @@ impl Belief {
             quiet: path,
             restless: path,
             odds: [0.0, f64::NEG_INFINITY],
+        }
+    }
+
+    fn likelier(&self) -> &Path {
+        if self.odds[1] > self.odds[0] {
+            &self.restless
+        } else {
+            &self.quiet
         }
     }
 
@@ -403,7 +416,7 @@ impl Following {
         });
     }
 
-    /// Takes in a tick. Gives what the bead does instead of following the commands, and the zero flow of before, um.
+    /// Takes in a tick. Gives what the bead does instead of following the commands, and the displacement at which it then rests, um.
     pub(super) fn step(&mut self, seen: &Seen) -> Option<(Instead, f64)> {
         if self.gain == 0.0 {
             return None;
@@ -478,7 +491,8 @@ impl Following {
             ..
         } = beliefs;
         if against.evidence.min(*beyond_shake) > EVIDENCE.max(adrift.evidence) {
-            return Some((Instead::Against, against.zero_flow_um));
+            let path = against.belief.likelier();
+            return Some((Instead::Against, path.rest_um(self.mean_um, self.gain)));
         }
         let goes = adrift.evidence > EVIDENCE && beliefs.compared.2;
         goes.then_some((Instead::Adrift, beliefs.adrift.zero_flow_um))

@@ -138,12 +138,20 @@ impl<R: ReferenceGenerator> Core<R> {
     }
 
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
+        let rest_um = (self.state.rest).zero_flow_um(self.controller.neutral_um());
+        self.freeze_at(reason, rest_um, tick);
+    }
+
+    /// The same at a displacement at which the bead rests, um.
+    pub(super) fn freeze_at(&mut self, reason: FreezeReason, rest_um: f64, tick: &mut Tick) {
         if self.state.life != Life::Running {
             return;
         }
-        if !self.state.frozen.has(reason) {
+        // Where commands work the other way round, later estimates of the zero flow are worth nothing.
+        let known = self.state.frozen.has(FreezeReason::NotFollowing);
+        if !self.state.frozen.has(reason) && !known {
             let newest_um = self.controller.neutral_um();
-            self.state.rest_um = self.state.rest.zero_flow_um(newest_um);
+            self.state.rest_um = rest_um;
             if BLIND.contains(&reason) && self.state.rest_um != newest_um {
                 self.controller.rest_at(self.state.rest_um);
             }

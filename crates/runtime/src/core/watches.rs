@@ -24,7 +24,8 @@ impl<R: ReferenceGenerator> Core<R> {
         );
     }
 
-    /// A bead that moves against the commands, or follows them up to a level and no further, is frozen at the zero flow of before.
+    /// A bead that moves against the commands is frozen at the zero flow that its motion shows if they work the other way round; one
+    /// that follows them up to a level and no further, at the zero flow of before.
     pub(super) fn watch_following(
         &mut self,
         fix: Option<LoopMeasurement>,
@@ -51,17 +52,18 @@ impl<R: ReferenceGenerator> Core<R> {
             command_um: output.command_um,
             zero_flow_um: output.neutral_um,
         });
-        let Some((instead, zero_flow_um)) = found else {
-            return;
-        };
-        if instead == Instead::Adrift {
-            state.clipped = true;
-            tick.flags.set(TickFlags::CLIPPED);
-            tick.event(EventKind::ActuatorClipped {
-                level_um: zero_flow_um,
-            });
+        match found {
+            None => {}
+            Some((Instead::Against, rest_um)) => {
+                self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
+            }
+            Some((Instead::Adrift, level_um)) => {
+                state.clipped = true;
+                tick.flags.set(TickFlags::CLIPPED);
+                tick.event(EventKind::ActuatorClipped { level_um });
+                self.freeze(FreezeReason::NotFollowing, tick);
+            }
         }
-        self.freeze(FreezeReason::NotFollowing, tick);
     }
 
     /// Gain and lag of the plant from its motion; their changes are events.
