@@ -90,6 +90,8 @@ struct State {
     in_force: in_force::Board,
     told_um: f64,
     following: following::Following,
+    /// Where the PZT rests while it is found out whether commands work the other way round, um, and the last tick of that.
+    pause: Option<(f64, u64)>,
     /// It was found that the bead does not feel the commands.
     clipped: bool,
     /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
@@ -225,6 +227,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 in_force: in_force::Board::new(displacement_um, neutral_um),
                 told_um: neutral_um,
                 following,
+                pause: None,
                 clipped: false,
                 rest: rest::Rest::new(neutral_um, timing.camera_delay_ms * 1e-3 / sample_s),
                 rest_um: neutral_um,

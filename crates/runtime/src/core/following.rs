@@ -7,24 +7,29 @@
 //! in proportion to the commands for long. Commands that cancel a flow look as if neither moved the bead: one that does not feel
 //! them is looked for only while it goes further and further away.
 //!
+//! While the loop pushes, a wrong sign and a flow that rises look alike. In a pause they do not: with the PZT where a bead with a
+//! wrong sign rests, that bead stops, and a flow carries it on. So a wrong sign is told after a pause of a few ticks only.
+//!
 //! A picture that shakes and an actuator that rings move the bead in no hypothesis of these. A wrong sign must then predict the motion
 //! better than its mere size does.
 //!
 //! Limit: a flow of more than 2 um that rises within 40 ms (1 % to 99 %) grows just as a loop with a wrong sign does, and can be taken
 //! for one.
 
+mod belief;
+
 use crate::keeping::Hold;
-use cellpos_control::{EstimatorConfig, LoopModel, flow_step_log_density};
+use belief::{Belief, Noise, Path};
+use cellpos_control::{EstimatorConfig, LoopModel};
 
 /// Natural logarithm of the odds that are asked for. Where a model is exact, Page's test is wrong once in e^32 ticks, 2,500 years at 1 kHz;
 /// e^20 would do for a year. The rest is for flows that rise as no model here does: evidence of a wrong sign grows with the square of an
 /// error that grows e-fold in 8 ms, so that it costs 4 ms ln(32 / 20) = 2 ms.
 const EVIDENCE: f64 = 32.0;
-/// Standard deviation of the gain over the model's: loops are made for a half to twice of it; and its limits.
-const GAIN_SD: f64 = 0.35;
-const GAIN_RANGE: [f64; 2] = [0.4, 2.5];
-/// What the size of the gain may change by when its sign does.
-const FLIP_SD: f64 = 0.1;
+/// Evidence of a wrong sign at which the loop pauses, its PZT where the bead then rests: there the bead stops if the sign is wrong, and a
+/// flow goes on. The rest of the evidence is what it costs the flow to stop at just that time, e^15 by [`cellpos_control::flow_step_log_density`].
+/// In a hold it comes about once in e^16 ticks, 2.5 h, and costs 60 nm.
+const PAUSE_EVIDENCE: f64 = 0.5 * EVIDENCE;
 /// Time in which what was learnt of the gain is forgotten, s: a hold tells it to 10 % in that time, for commands answer the walk.
 const GAIN_MEMORY_S: f64 = 1.0;
 /// Time over which commands are averaged, to count them from there, s: a hundred delays.
@@ -32,8 +37,6 @@ const MEAN_S: f64 = 0.25;
 /// Time over which the mean square of the bead's motion in a tick is taken, s. One that grows e-fold in 8 ms is then six times its mean,
 /// sqrt(0.15 / 0.004), which speaks against a mere shake.
 const SHAKE_S: f64 = 0.15;
-/// A flow starts to change as often as it steps, so often in a second.
-const CHANGES_PER_S: f64 = 0.01;
 /// Delays in which a flow that grows at its fastest grows by a factor e: 5 ms. A loop with a wrong sign does in 8 ms, the solution
 /// of s = 0.43 / T exp(-s T) with the delay T of 2.5 ms and the usual margins.
 const GROWTH_DELAYS: f64 = 2.0;
@@ -51,217 +54,22 @@ const COMMANDS: usize = 64;
 /// Share of the model's speed that may be its slow modes': a plant that answers later is not told from a flow.
 const SLOW_SHARE: f64 = 0.5;
 
-/// Numbers that all paths share; um and ticks.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Noise {
-    /// Variance of the bead's walk and of the flow's in a tick.
-    walk_um2: f64,
-    flow_um2: f64,
-    /// Speed of a flow that has begun to change, and its growth in a tick.
-    change_um: f64,
-    growth: f64,
-    /// Change of a flow in a tick below which it is not seen: while it grows it moves the bead by less than its walk.
-    least_um: f64,
-    /// What a tick leaves of what is known of the gain.
-    kept: f64,
-    sample_s: f64,
-}
-
-/// Position, flow, its change, and gain over the model's, with covariance.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Path {
-    /// Sign of the gain; 0: the bead does not feel the commands.
-    sign: f64,
-    x: [f64; 4],
-    p: [[f64; 4]; 4],
-}
-
-impl Path {
-    fn at(position_um: f64, variance_um2: f64, flow_um: f64) -> Self {
-        let mut p = [[0.0; 4]; 4];
-        p[0][0] = variance_um2;
-        p[1][1] = flow_um * flow_um;
-        p[3][3] = GAIN_SD * GAIN_SD;
-        Self {
-            sign: 1.0,
-            x: [position_um, 0.0, 0.0, 1.0],
-            p,
-        }
-    }
-
-    /// The same bead, which no longer feels the commands: it goes on as it goes, now that they drive it by `driven_um`.
-    fn adrift(mut self, driven_um: f64) -> Self {
-        self.add(1, 3, driven_um);
-        (self.sign, self.x[3]) = (0.0, 0.0);
-        for k in 0..4 {
-            (self.p[3][k], self.p[k][3]) = (0.0, 0.0);
-        }
-        self
-    }
-
-    /// The same bead with the opposite sign of its gain.
-    fn against(mut self) -> Self {
-        self.sign = -1.0;
-        self.x[3] = -self.x[3];
-        for k in 0..3 {
-            self.p[3][k] = -self.p[3][k];
-            self.p[k][3] = -self.p[k][3];
-        }
-        self.p[3][3] += FLIP_SD * FLIP_SD;
-        self
-    }
-
-    /// Displacement at which the bead rests, um; commands are counted from `mean_um`.
-    fn rest_um(&self, mean_um: f64, gain: f64) -> f64 {
-        mean_um - self.x[1] / (self.x[3] * gain)
-    }
-
-    /// Adds a multiple of one state to another: x' = F x, P' = F P F^T.
-    fn add(&mut self, to: usize, from: usize, factor: f64) {
-        self.x[to] += factor * self.x[from];
-        for k in 0..4 {
-            self.p[to][k] += factor * self.p[from][k];
-        }
-        for row in &mut self.p {
-            row[to] += factor * row[from];
-        }
-    }
-
-    /// One tick in which the model's bead goes `driven_um`, give or take `doubt_um`. The flow of a restless path changes.
-    fn advance(&mut self, driven_um: f64, doubt_um: f64, restless: bool, noise: &Noise) {
-        self.add(0, 1, 1.0);
-        self.add(0, 2, 0.5);
-        self.add(0, 3, driven_um);
-        self.add(1, 2, 1.0);
-        self.p[0][0] += noise.walk_um2 + doubt_um * doubt_um;
-        self.p[1][1] += noise.flow_um2;
-        if restless {
-            let change_um = self.x[2].abs().max(noise.least_um) * noise.growth;
-            self.p[2][2] += change_um * change_um;
-        }
-        let kept = noise.kept;
-        self.x[3] = self.sign + kept * (self.x[3] - self.sign);
-        for k in 0..4 {
-            self.p[3][k] *= kept;
-            self.p[k][3] *= kept;
-        }
-        self.p[3][3] += (1.0 - kept * kept) * (self.sign * GAIN_SD).powi(2);
-    }
-
-    /// Takes a fix in, `ticks` after the one before; gives the logarithm of its likelihood.
-    fn correct(&mut self, position_um: f64, variance_um2: f64, ticks: f64, sample_s: f64) -> f64 {
-        let off_um = position_um - self.x[0];
-        let spread_um2 = self.p[0][0] + variance_um2;
-        let quiet =
-            -0.5 * (off_um * off_um / spread_um2 + (std::f64::consts::TAU * spread_um2).ln());
-        let stepped = flow_step_log_density(off_um, ticks * sample_s);
-        if stepped > quiet {
-            // The flow is as uncertain as the step that the fix shows.
-            let speed_um = off_um / ticks;
-            self.p[0][0] += off_um * off_um;
-            self.p[0][1] += off_um * speed_um;
-            self.p[1][0] += off_um * speed_um;
-            self.p[1][1] += speed_um * speed_um;
-        }
-        let spread_um2 = self.p[0][0] + variance_um2;
-        let first = self.p[0];
-        let gains = first.map(|p| p / spread_um2);
-        for (x, gain) in self.x.iter_mut().zip(gains) {
-            *x += gain * off_um;
-        }
-        for (row, gain) in self.p.iter_mut().zip(gains) {
-            for (p, first) in row.iter_mut().zip(first) {
-                *p -= gain * first;
-            }
-        }
-        let [least, most] = GAIN_RANGE;
-        self.x[3] = self.sign * (self.sign * self.x[3]).clamp(least, most);
-        quiet.max(stepped)
-    }
-}
-
-/// A hypothesis on the bead, with a flow that is quiet and with one that has begun to change.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Belief {
-    quiet: Path,
-    restless: Path,
-    /// Logarithms of their likelihoods less that of the likelier one.
-    odds: [f64; 2],
-}
-
-impl Belief {
-    fn of(path: Path) -> Self {
-        Self {
-            quiet: path,
-            restless: path,
-            odds: [0.0, f64::NEG_INFINITY],
-        }
-    }
-
-    fn likelier(&self) -> &Path {
-        if self.odds[1] > self.odds[0] {
-            &self.restless
-        } else {
-            &self.quiet
-        }
-    }
-
-    fn against(self) -> Self {
-        Self {
-            quiet: self.quiet.against(),
-            restless: self.restless.against(),
-            ..self
-        }
-    }
-
-    fn adrift(self, driven_um: f64) -> Self {
-        Self {
-            quiet: self.quiet.adrift(driven_um),
-            restless: self.restless.adrift(driven_um),
-            ..self
-        }
-    }
-
-    /// Moves on by a tick; commands are counted from a displacement at which the model drives the bead `shift_um` further.
-    fn advance(&mut self, driven_um: f64, doubt_um: f64, shift_um: f64, noise: &Noise) {
-        for (path, restless) in [(&mut self.quiet, false), (&mut self.restless, true)] {
-            path.add(1, 3, shift_um);
-            path.advance(driven_um, doubt_um, restless, noise);
-        }
-    }
-
-    /// Takes a fix in; gives the logarithm of its likelihood.
-    fn correct(&mut self, position_um: f64, variance_um2: f64, ticks: f64, noise: &Noise) -> f64 {
-        let likely =
-            |path: &mut Path| path.correct(position_um, variance_um2, ticks, noise.sample_s);
-        let [quiet, restless] = self.odds;
-        let mut odds = [
-            quiet + likely(&mut self.quiet),
-            restless + likely(&mut self.restless),
-        ];
-        let cost = -(CHANGES_PER_S * ticks * noise.sample_s).min(1.0).ln();
-        if odds[1] < odds[0] - cost {
-            odds[1] = odds[0] - cost;
-            self.restless = self.quiet;
-            self.restless.p[1][1] += noise.change_um * noise.change_um;
-            self.restless.p[2][2] += noise.least_um * noise.least_um;
-        } else if odds[0] < odds[1] - cost {
-            odds[0] = odds[1] - cost;
-            self.quiet = self.restless;
-        }
-        let most = odds[0].max(odds[1]);
-        self.odds = odds.map(|odds| odds - most);
-        most
-    }
-}
-
 /// What the bead does instead of following.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Instead {
+    /// Perhaps it goes against the commands: a pause tells.
+    Unclear,
     /// It goes against the commands.
     Against,
     /// It does not feel them.
     Adrift,
+}
+
+/// A pause of the loop: ticks since it began, and the evidence before its command showed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Pause {
+    ticks: usize,
+    evidence: f64,
 }
 
 /// A hypothesis beside the usual one, and how much likelier it is, natural logarithm of the odds.
@@ -271,6 +79,8 @@ struct Rival {
     evidence: f64,
     /// Zero flow when it began to be the likelier one, um.
     zero_flow_um: f64,
+    /// The pause that was made for it.
+    pause: Option<Pause>,
 }
 
 impl Rival {
@@ -279,7 +89,22 @@ impl Rival {
             belief,
             evidence: 0.0,
             zero_flow_um,
+            pause: None,
         }
+    }
+
+    /// Whether a pause for it is over, and whether the hypothesis is refuted; a command takes `delay` ticks to show.
+    fn judge_pause(&mut self, delay: usize) -> (bool, bool) {
+        let unlikely = self.evidence <= 0.0;
+        let Some(pause) = &mut self.pause else {
+            return (false, unlikely);
+        };
+        if pause.ticks <= delay {
+            pause.evidence = self.evidence;
+        }
+        let over = pause.ticks >= 2 * delay;
+        // A bead that went on in the pause is carried by a flow.
+        (over, unlikely || over && self.evidence <= pause.evidence)
     }
 }
 
@@ -400,6 +225,11 @@ impl Following {
         }
     }
 
+    /// Ticks of a pause: until its command shows, and as long again.
+    pub(super) fn pause_ticks(&self) -> u64 {
+        2 * self.delay as u64
+    }
+
     /// The ticks before do not count: the loop did not run, the bead was held by something, or what stood at the PZT is not known.
     pub(super) fn clear(&mut self) {
         self.known = 0;
@@ -445,6 +275,9 @@ impl Following {
             with.advance(driven_um, doubt_um, shift_um, &self.noise);
             (against.belief).advance(driven_um, doubt_um, shift_um, &self.noise);
             adrift.belief.advance(0.0, 0.0, 0.0, &self.noise);
+            if let Some(pause) = &mut against.pause {
+                pause.ticks = pause.ticks.saturating_add(1);
+            }
         }
         let (position_um, variance_um2) = seen.fix?;
         let ticks = std::mem::take(&mut self.since_fix).max(1.0);
@@ -477,7 +310,8 @@ impl Following {
         let against = likely(&mut beliefs.against.belief);
         beliefs.against.evidence += against - usual;
         beliefs.beyond_shake += against - beliefs.shaken(position_um, ticks, self.shake_share);
-        if beliefs.against.evidence <= 0.0 {
+        let (paused, refuted) = beliefs.against.judge_pause(self.delay);
+        if refuted {
             beliefs.against = Rival::of(beliefs.with.against(), zero_flow_um);
             beliefs.beyond_shake = 0.0;
         }
@@ -490,9 +324,20 @@ impl Following {
             beyond_shake,
             ..
         } = beliefs;
-        if against.evidence.min(*beyond_shake) > EVIDENCE.max(adrift.evidence) {
+        let evidence = against.evidence.min(*beyond_shake);
+        if evidence > PAUSE_EVIDENCE.max(adrift.evidence) {
             let path = against.belief.likelier();
-            return Some((Instead::Against, path.rest_um(self.mean_um, self.gain)));
+            let rest_um = path.rest_um(self.mean_um, self.gain);
+            if against.pause.is_none() {
+                against.pause = Some(Pause {
+                    ticks: 0,
+                    evidence: against.evidence,
+                });
+                return Some((Instead::Unclear, rest_um));
+            }
+            if evidence > EVIDENCE && paused {
+                return Some((Instead::Against, rest_um));
+            }
         }
         let goes = adrift.evidence > EVIDENCE && beliefs.compared.2;
         goes.then_some((Instead::Adrift, beliefs.adrift.zero_flow_um))

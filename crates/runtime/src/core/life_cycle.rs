@@ -114,7 +114,10 @@ impl<R: ReferenceGenerator> Core<R> {
         }
         let frozen = self.state.frozen;
         match (self.state.life, frozen.any()) {
-            (Life::Running, false) => Mode::Run,
+            (Life::Running, false) => match self.state.pause {
+                Some((rest_um, last)) if tick.index <= last => Mode::Direct(rest_um),
+                _ => Mode::Run,
+            },
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
                 // With the bead in view the estimate of the zero flow goes on and is the best there is.

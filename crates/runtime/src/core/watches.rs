@@ -54,6 +54,10 @@ impl<R: ReferenceGenerator> Core<R> {
         });
         match found {
             None => {}
+            Some((Instead::Unclear, rest_um)) => {
+                let ticks = state.following.pause_ticks();
+                state.pause = Some((rest_um, tick.index + ticks));
+            }
             Some((Instead::Against, rest_um)) => {
                 self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
             }

@@ -47,7 +47,7 @@ impl Default for World<'_> {
 /// When it was found, s, how far the bead was, um, and what it was.
 type Told = (f64, f64, Instead);
 
-/// A proportional loop with an integral on an integrator.
+/// A proportional loop with an integral on an integrator, which pauses when it is told to.
 fn told(world: &World<'_>) -> Option<Told> {
     let mut state = world.seed;
     let dt = 1.0 / world.rate_hz;
@@ -61,6 +61,7 @@ fn told(world: &World<'_>) -> Option<Told> {
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
     let mut seen = std::collections::VecDeque::from(vec![0.0; late + 1]);
     let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
+    let mut pause = None;
     for k in 0..(world.seconds * world.rate_hz) as u64 {
         let t = k as f64 * dt;
         let [low_um, high_um] = (world.range)(t);
@@ -90,15 +91,23 @@ fn told(world: &World<'_>) -> Option<Told> {
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
         zero_um -= 8.0 * dt * error_um;
-        command_um = (zero_um - 0.4 * error_um + (world.added)(t)).clamp(0.0, 40.0);
+        command_um = match pause {
+            Some((rest_um, last)) if k <= last => rest_um,
+            _ => zero_um - 0.4 * error_um + (world.added)(t),
+        };
+        command_um = command_um.clamp(0.0, 40.0);
         let found = following.step(&Seen {
             fix: Some((fix_um, 0.015_f64.powi(2))),
             reference_um,
             command_um,
             zero_flow_um: zero_um,
         });
-        if let Some((instead, _)) = found {
-            return Some((t, error_um, instead));
+        match found {
+            Some((Instead::Unclear, rest_um)) => {
+                pause = Some((rest_um, k + following.pause_ticks()))
+            }
+            Some((instead, _)) => return Some((t, error_um, instead)),
+            None => {}
         }
     }
     None
@@ -118,7 +127,7 @@ fn a_sign_that_flips_is_told_while_the_bead_is_in_the_picture() {
                     ..World::default()
                 });
                 let in_time = told.is_some_and(|(s, um, instead)| {
-                    (3.0..3.12).contains(&s) && um.abs() < 12.0 && instead == Instead::Against
+                    (3.0..3.12).contains(&s) && um.abs() < 3.0 && instead == Instead::Against
                 });
                 assert!(in_time, "gain {gain}, {rate_hz} Hz, seed {seed}: {told:?}");
             }
@@ -151,8 +160,9 @@ fn relaxes(tau_s: f64) -> impl Fn(f64) -> f64 {
 #[test]
 fn half_to_twice_the_gain_and_flows_that_step_drift_or_rise_are_followed() {
     let [fast, middle, slow] = [0.005, 0.02, 0.08].map(relaxes);
-    let [small, large] = [(2.6, 0.1), (-5.0, 0.1)].map(|(um, s)| logistic(um, s));
-    let flows: [&dyn Fn(f64) -> f64; 10] = [
+    let [small, large, soon] =
+        [(2.6, 0.1), (-5.0, 0.1), (2.6, 0.05)].map(|(um, s)| logistic(um, s));
+    let flows: [&dyn Fn(f64) -> f64; 11] = [
         &|_| 20.0,
         &|t| 20.0 + 0.2 * t,
         &|t| 10.0 + 6.0 * (t % 4.0 - 2.0).abs(),
@@ -163,6 +173,7 @@ fn half_to_twice_the_gain_and_flows_that_step_drift_or_rise_are_followed() {
         &slow,
         &small,
         &large,
+        &soon,
     ];
     for seed in 1..=2 {
         for gain in [0.5, 1.0, 2.0] {
