@@ -87,10 +87,14 @@ impl Estimator {
         // One fix decides little: an outlier or a jolt must not make a verdict. But nothing that is held moves, however
         // badly the motion fits the prediction: an unknown lag turns a fast motion to and fro about.
         const MOST: f64 = 2.0;
+        // A bead that does not walk is off the prediction by the noise of its fixes alone, if it follows: next to its target, where the
+        // commands are small, that tells in tenths of a second what a walk would hide for seconds.
+        let walks = state.still.evidence <= HELD_EVIDENCE;
+        let off_um2 = 2.0 * variance_um2 + if walks { walk_um2 } else { 0.0 };
         let odds = if moved {
             -MOST
         } else {
-            let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * noise_um2);
+            let odds = motion_um * (0.25 * motion_um - still_um) / (2.0 * off_um2.max(1e-12));
             odds.clamp(-MOST, MOST)
         };
         state.stuck_evidence = (state.stuck_evidence + odds).clamp(0.0, MOST_EVIDENCE);
