@@ -4,7 +4,9 @@ use crate::drawing::Drawing;
 use crate::figure::{Content, Figure, Panel};
 use crate::heat::heat_map;
 use crate::mosaic::mosaic;
-use crate::panel::{Entry, Frame, LEFT_PX, RIGHT_PX, data_range, draw_panel, entries, legend};
+use crate::panel::{
+    Entry, Frame, LEFT_PX, RIGHT_PX, data_range, draw_panel, entries, head_px, legend,
+};
 use crate::svg::{self, SLIM_PX, STYLE, WIDTH_PX, px};
 use std::fmt::Write;
 
@@ -88,11 +90,15 @@ fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_p
     for (row_index, row) in panels.chunks(columns).enumerate() {
         let last_row = (row_index + 1) * columns >= panels.len();
         let mut tallest: f64 = 0.0;
+        let inner = width - LEFT_PX - RIGHT_PX;
+        let heads = row.iter().map(|panel| head_px(panel, &told, inner));
+        let head_px = heads.fold(0.0, f64::max);
         for (column, panel) in row.iter().enumerate() {
             let frame = Frame {
                 left: column as f64 * width + LEFT_PX,
                 top,
-                width: width - LEFT_PX - RIGHT_PX,
+                width: inner,
+                head_px,
                 x_range: shared.unwrap_or_else(|| data_range(panel, true)),
                 show_x: !(figure.share_x && columns == 1) || last_row,
                 told: &told,

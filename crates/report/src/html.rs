@@ -35,6 +35,7 @@ enum Block {
     Figure(Figure),
     Picture(Picture),
     Result(Emphasis, String),
+    Certainty(String),
     Lead(String),
     Fold(String),
     Unfold,
@@ -84,6 +85,11 @@ impl Report {
     /// Adds the result: one sentence, at the top of the page.
     pub fn result(&mut self, status: Emphasis, sentence: &str) -> &mut Self {
         self.push(Block::Result(status, sentence.to_owned()))
+    }
+
+    /// Says below the result how sure it is: of what its intervals are, and what they leave out.
+    pub fn certainty(&mut self, text: &str) -> &mut Self {
+        self.push(Block::Certainty(text.to_owned()))
     }
 
     /// Says below the title what was done: with what, how, when. A text of more than 400 characters is cut.
@@ -221,6 +227,10 @@ impl Report {
                         "<p class=\"result {class}\">{sign}{}</p>",
                         set_together(text)
                     );
+                }
+                Block::Certainty(text) => {
+                    let text = set_together(text);
+                    let _ = writeln!(out, "<p class=\"sure\"><b>How sure:</b> {text}</p>");
                 }
                 Block::Lead(text) => {
                     let _ = writeln!(out, "<p class=\"lead\">{}</p>", set_together(text));

@@ -21,6 +21,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) x_range: Option<(f64, f64)>,
     /// Whether the x axis has its numbers and title (only the lowest of panels that share it).
     pub(crate) show_x: bool,
+    /// Room for title and legend, at least: panels of one row have their axes at one height.
+    pub(crate) head_px: f64,
     /// Entries of the legends above.
     pub(crate) told: &'a [Entry<'a>],
 }
@@ -81,6 +83,12 @@ pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
     range
 }
 
+/// Height of title and legend of a panel, px.
+pub(crate) fn head_px(panel: &Panel, told: &[Entry<'_>], width: f64) -> f64 {
+    let title = if panel.title.is_empty() { 0.0 } else { LINE_PX };
+    title + legend(&mut Drawing::default(), panel, told, (0.0, 0.0), width)
+}
+
 /// Draws one panel and returns its height with title, legend and axis texts.
 pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>) -> f64 {
     let mut top = frame.top;
@@ -94,7 +102,7 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
         top += LINE_PX;
     }
     top += legend(drawing, panel, frame.told, (frame.left, top), frame.width);
-    top += 4.0;
+    top = top.max(frame.top + frame.head_px) + 4.0;
 
     let (mut width, mut height) = (frame.width, panel.height_px);
     let y_range = data_range(panel, false);

@@ -12,7 +12,7 @@ figcaption{color:#5c6470;font-size:13px;margin-top:4px}\
 .slim{display:none}.take{white-space:nowrap;user-select:none}.take a{margin-left:6px;font-weight:600}\
 p.lead{color:#5c6470;font-size:14px;margin:-8px 0 12px;overflow-wrap:anywhere}\
 p.result{font-size:20px;line-height:1.4;font-weight:600;margin:10px 0 14px;padding:12px 16px;border-left:6px solid #9aa3ae;background:#f5f7f9;border-radius:0 8px 8px 0}\
-p.result.good{border-color:#009e73;background:#eaf6f1}p.result.warning{border-color:#d99a00;background:#fdf6e3}p.result.bad{border-color:#c8372d;background:#fcecea}\
+p.sure{font-size:14px;margin:-4px 0 12px}p.result.good{border-color:#009e73;background:#eaf6f1}p.result.warning{border-color:#d99a00;background:#fdf6e3}p.result.bad{border-color:#c8372d;background:#fcecea}\
 details{margin:16px 0;border-top:1px solid #dfe3e8;padding-top:8px}summary{cursor:pointer;font-weight:600;font-size:16px}\
 @media(max-width:760px){.wide{display:none}.slim{display:block}.slim svg{width:100%;max-width:520px}figure .scroll svg{max-width:none}td:last-child:not(.num){min-width:15em}}\
 .scroll{overflow-x:auto;margin:12px 0}table{border-collapse:collapse;font-size:13.5px}\

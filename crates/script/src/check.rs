@@ -76,6 +76,15 @@ pub struct WaveCheck {
     pub largest_um: f64,
 }
 
+/// How much of a limit a script uses.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LimitUse {
+    /// The limit: `PZT range`, `PZT slew`, `field of view`.
+    pub what: &'static str,
+    /// Largest share of what is allowed, the reserve taken off; above 1 the script is refused.
+    pub share: f64,
+}
+
 /// The result of a check.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Check {
@@ -93,6 +102,10 @@ pub struct Check {
     pub pzt_speed_um_per_s: f64,
     /// All positions (from the start) times this factor would just be allowed; below 1 the script is refused.
     pub largest_factor: f64,
+    /// How much of each limit is used.
+    pub used: Vec<LimitUse>,
+    /// Cycles in the reference below, in which long repeats are shortened.
+    pub cycles_shown: u64,
     /// Every wave of the script, with the largest amplitude that the rig could do.
     pub waves: Vec<WaveCheck>,
     /// What the rig cannot do; empty: the script can run.
@@ -176,6 +189,8 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
         pzt_um: (limits.neutral_um, limits.neutral_um),
         pzt_speed_um_per_s: 0.0,
         largest_factor: f64::INFINITY,
+        used: Vec::new(),
+        cycles_shown: plan.cycle_count(),
         waves: Vec::new(),
         violations: Vec::new(),
         time_s: Vec::new(),
@@ -213,6 +228,7 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
             ("PZT slew", pzt_speed, slew, "um/s"),
             ("field of view", view_um, limits.view_um, "um"),
         ] {
+            out.uses(what, asked / allowed);
             if asked > 0.0 {
                 out.largest_factor = out.largest_factor.min(allowed / asked);
             }
@@ -264,6 +280,20 @@ impl Check {
                 largest_um: most_um,
             }),
         }
+    }
+
+    /// Keeps the largest share of each limit.
+    fn uses(&mut self, what: &'static str, share: f64) {
+        match self.used.iter_mut().find(|known| known.what == what) {
+            Some(known) => known.share = known.share.max(share),
+            None => self.used.push(LimitUse { what, share }),
+        }
+    }
+
+    /// The limit that a larger script would meet first; none if nothing moves.
+    pub fn tightest(&self) -> Option<LimitUse> {
+        let moved = self.used.iter().filter(|one| one.share > 0.0);
+        moved.max_by(|a, b| a.share.total_cmp(&b.share)).copied()
     }
 
     /// Keeps the worst of each kind at each line.

@@ -33,11 +33,11 @@ mod script;
 mod shuffle;
 mod table;
 
-pub use check::{Check, CheckError, CheckLimits, Violation, WaveCheck, check};
+pub use check::{Check, CheckError, CheckLimits, LimitUse, Violation, WaveCheck, check};
 pub use cursor::{Cursor, Output, Progress, Seen, StopReason};
 pub use cycles::{
     Alarm, AmplitudeWatch, AtRest, CycleColumns, CycleFlags, CycleRow, CycleTable, FatigueStop,
-    FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, read_cycles, trend,
+    FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, read_cycles, student95, trend,
 };
 pub use error::ScriptError;
 pub use follow::Follower;

@@ -56,7 +56,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let (limits, knows_view) = limits(&args)?;
     let result = check(&script, &model, &limits).map_err(Failure::input)?;
     if let Some(path) = &args.report {
-        report(&script, &result, &limits)
+        report(&script, &result, &limits, &args)
             .write_with_figures(path)
             .map_err(Failure::failed)?;
     }
@@ -220,63 +220,131 @@ fn json(script: &Script, check: &Check) -> serde_json::Value {
     })
 }
 
-fn report(script: &Script, check: &Check, limits: &CheckLimits) -> Report {
-    let mut report = Report::new(&format!("Check of {}", script.file));
-    report.lead(&format!(
-        "Task: check the script {} against the model and the limits of the rig, before it runs. All figures are calculated; nothing moved.",
-        script.file
-    ));
-    match check.violations.len() {
-        0 => report.result(
-            Emphasis::Good,
-            &format!(
-                "The script can run within the limits of this rig: {:.1} s without waits, {} cycles. The PZT needs {:.2} to {:.2} um of its \
-                 {} to {} um; all positions could be larger by a factor of {}.",
-                check.duration_s,
-                check.cycles,
-                check.pzt_um.0,
-                check.pzt_um.1,
-                limits.low_um,
-                limits.high_um,
-                factor(check)
-            ),
-        ),
-        1 => report.result(
-            Emphasis::Bad,
-            "The script cannot run: it breaks one limit of this rig.",
-        ),
-        many => report.result(
-            Emphasis::Bad,
-            &format!("The script cannot run: it breaks limits of this rig in {many} places."),
-        ),
+/// What came out, in a sentence.
+fn sentence(check: &Check, limits: &CheckLimits) -> (Emphasis, String) {
+    let broken = match check.violations.len() {
+        0 => {
+            let room = check.tightest().map_or_else(
+                || " Nothing moves in it.".to_owned(),
+                |tightest| {
+                    format!(
+                        " The tightest limit is the {}, of which it uses {:.0} %: all positions could be {} times as large.",
+                        in_words(tightest.what, limits),
+                        1e2 * tightest.share,
+                        short(check.largest_factor)
+                    )
+                },
+            );
+            let cycles = match check.cycles {
+                0 => String::new(),
+                1 => " in one cycle".to_owned(),
+                many => format!(" in {many} cycles"),
+            };
+            return (
+                Emphasis::Good,
+                format!(
+                    "The script can run within the limits of this rig. It lasts {:.1} s{cycles}, waits for an event not \
+                     counted.{room}",
+                    check.duration_s
+                ),
+            );
+        }
+        1 => "one limit of this rig".to_owned(),
+        many => format!("limits of this rig in {many} places"),
     };
+    let factor = short(check.largest_factor);
+    let text = format!(
+        "The script cannot run: it breaks {broken}. It could with all positions multiplied by {factor} or less."
+    );
+    (Emphasis::Bad, text)
+}
+
+/// To two digits, so as not to promise more than is free.
+fn short(factor: f64) -> String {
+    let digits = (1.0 - factor.log10().floor()).clamp(0.0, 4.0) as i32;
+    let unit = 10f64.powi(digits);
+    format!("{:.*}", digits as usize, (factor * unit).floor() / unit)
+}
+
+/// A limit with its value.
+fn in_words(what: &str, limits: &CheckLimits) -> String {
+    match what {
+        "PZT range" => format!(
+            "range of the piezo (PZT), {} to {} um",
+            limits.low_um, limits.high_um
+        ),
+        "PZT slew" => format!("speed of the piezo (PZT), {} um/s", limits.slew_um_per_s),
+        _ => format!("field of view, {} um to each side", limits.view_um),
+    }
+}
+
+/// Reference, PZT displacement that it takes, and how much of each limit is used.
+fn figure(check: &Check) -> Figure {
+    let cut = match check.cycles_shown < check.cycles {
+        true => format!(
+            "{} of {} cycles are drawn, without the others and with long holds cut short: the time axis is that of what is drawn",
+            check.cycles_shown, check.cycles
+        ),
+        false => "Waits take no time here".to_owned(),
+    };
+    let time = || match check.cycles_shown < check.cycles {
+        true => Axis::linear(
+            &format!("time, {} of {} cycles", check.cycles_shown, check.cycles),
+            "s",
+        ),
+        false => Axis::linear("time", "s"),
+    };
+    let names: Vec<&str> = check.used.iter().map(|one| one.what).collect();
+    let at: Vec<f64> = (0..names.len()).map(|n| n as f64).collect();
+    let used: Vec<f64> = check.used.iter().map(|one| 1e2 * one.share).collect();
+    Figure::new(
+        "reference",
+        &format!(
+            "Position that the script asks for, displacement of the piezo (PZT) that the model needs for it, and the largest share of each \
+             limit, the reserve taken off. {cut}."
+        ),
+    )
+    .panel(
+        Panel::new(time(), Axis::linear("position of the bead", "um"))
+            .series(Series::line("", &check.time_s, &check.reference_um)),
+    )
+    .panel(
+        Panel::new(Axis::categories("", &names), Axis::linear("used", "%"))
+            .series(Series::bars("", &at, &used, 0.6).color(1))
+            .horizontal(100.0, "limit"),
+    )
+    .panel(
+        Panel::new(time(), Axis::linear("PZT", "um"))
+            .series(Series::step("", &check.time_s, &check.demand_um).color(2)),
+    )
+    .columns(2)
+}
+
+fn report(script: &Script, check: &Check, limits: &CheckLimits, args: &Args) -> Report {
+    let mut report = Report::new(&format!("Check of {}", script.file));
+    let rig = match &args.rig {
+        Some(path) => format!("of the rig {}", path.display()),
+        None => "of a rig as in the paper, for want of a rig file".to_owned(),
+    };
+    report.lead(&format!(
+        "Task: check the script {} before it runs: against the limits {rig}, and the model {} of how a bead follows the piezo. All figures \
+         are calculated; nothing moved.",
+        script.file, args.model
+    ));
+    let (status, sentence) = sentence(check, limits);
+    report.result(status, &sentence);
+    report.certainty(&format!(
+        "calculated for a bead that follows the model exactly. {:.0} % of the piezo's range and speed are kept free for the loop's answer to \
+         noise and drift, and for a gain other than the model's; the field of view has no such reserve.",
+        1e2 * limits.reserve
+    ));
     if !script.notes.is_empty() {
         report.paragraph(&script.notes);
     }
     for line in violations(script, check) {
         report.note(Emphasis::Bad, &line);
     }
-    let time = || Axis::linear("time", "s");
-    report.figure(
-        Figure::new(
-            "reference",
-            "Reference and PZT demand; long repeats and waves are shortened, waits take no time.",
-        )
-        .panel(
-            Panel::new(time(), Axis::linear("bead", "um")).series(Series::line(
-                "reference",
-                &check.time_s,
-                &check.reference_um,
-            )),
-        )
-        .panel(
-            Panel::new(time(), Axis::linear("PZT", "um"))
-                .series(Series::step("demand", &check.time_s, &check.demand_um).color(2))
-                .horizontal(limits.low_um, "lower limit")
-                .horizontal(limits.high_um, "upper limit"),
-        )
-        .share_x(),
-    );
+    report.figure(figure(check));
     let mut table = Table::new([Column::left("figure"), Column::right("value")]);
     for (name, value) in figures(check) {
         table.row([name, value.as_str()]);

@@ -3,6 +3,7 @@
 mod bound;
 mod clips;
 mod compare;
+mod course;
 mod cycles;
 mod envelope;
 mod fatigue;
@@ -25,7 +26,9 @@ use cellpos_record::{RunEnd, RunReader};
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_runtime::Summary;
 use cellpos_runtime::summary::plan_warning;
+use cellpos_script::CycleRow;
 pub(crate) use cycles::{half95, was_elsewhere, with_interval};
+pub(crate) use fatigue::OF_FIRST_LENGTH;
 use origin::what_it_was;
 use recorded::Recorded;
 use session::{Session, ending, events, provenance, timing};
@@ -90,22 +93,18 @@ fn single(run: &Path, args: &Args) -> CommandResult {
     let has_error = ticks.rms_um().is_some();
     page.figure(match of_a_cell {
         Some(figure) => figure,
-        None if has_error => result::error_figure(ticks, bound.as_ref(), !cycles.rows.is_empty()),
+        None if has_error => result::error_figure(ticks, bound.as_ref(), &cycles.rows),
         // A run without an error still shows what happened.
         None => over_the_run(ticks),
     });
     if is_cell && let Some(montage) = montage::figure(sessions, &cycles.rows) {
         page.figure(montage);
     }
-    head(&mut page, sessions, ticks);
+    head(&mut page, sessions, ticks, &cycles.rows);
     traces(&mut page, ticks, is_cell || has_error);
     if is_cell && has_error {
         page.section("Error");
-        page.figure(result::error_figure(
-            ticks,
-            bound.as_ref(),
-            !cycles.rows.is_empty(),
-        ));
+        page.figure(result::error_figure(ticks, bound.as_ref(), &cycles.rows));
     }
     spectrum(&mut page, ticks, meta);
     let trends = cycles::section(&mut page, cycles, is_cell);
@@ -160,7 +159,7 @@ fn nm(um: Option<f64>) -> String {
     )
 }
 
-fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
+fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks, cycles: &[CycleRow]) {
     if let Some(last) = sessions.last() {
         let (status, text) = ending(last);
         let text = match sessions.len() {
@@ -205,17 +204,22 @@ fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks) {
             page.note(Emphasis::Warning, &text);
         }
     }
-    let rows = [
+    let mut rows = vec![
         ("ticks", ticks.rows.to_string()),
         ("duration (s)", format!("{:.3}", ticks.duration_s())),
-        ("error, RMS (nm)", nm(ticks.rms_um())),
-        ("error, mean (nm)", nm(ticks.mean_um())),
-        ("error, largest (nm)", nm(ticks.peak_um())),
     ];
+    if let Some(error) = result::cycles_error(cycles) {
+        rows.push(("error over the cycles, RMS (nm)", error));
+    }
+    rows.extend([
+        ("error after two seconds, RMS (nm)", nm(ticks.rms_um())),
+        ("its mean (nm)", nm(ticks.mean_um())),
+        ("its largest (nm)", nm(ticks.peak_um())),
+    ]);
     let mut table = Table::key_values(&rows);
     table.caption(
-        "Errors: measured position less the reference of the time of its exposure, from two seconds after the loop was closed (or \
-         went on after a freeze) until the bead was frozen or the PZT parked; the same as the terminal and run.toml have.",
+        "Errors: measured position less the reference of the time of its exposure. After two seconds: from two seconds after the loop \
+         was closed (or went on after a freeze) until the bead was frozen or the PZT parked; the same as the terminal and run.toml have.",
     );
     page.table(table);
     if sessions.len() > 1 {

@@ -33,6 +33,9 @@ pub struct Tracked {
     pub rms_measured_nm: Option<f64>,
     /// RMS of true position less reference after 2 s, nm; emulated rigs only.
     pub rms_true_nm: Option<f64>,
+    /// Mean squares of the error over tenths of a second, or periods of a slower sine, nm^2 (of the true error if known).
+    #[serde(skip)]
+    pub pieces_nm2: Vec<f64>,
     /// The last half second: time, s, and error (true error if known), um.
     #[serde(skip)]
     pub trace: (Vec<f64>, Vec<f64>),
@@ -251,6 +254,18 @@ impl RunSink for Errors {
     fn progress(&mut self, _: &Statistics) {}
 }
 
+/// Mean squares of errors after two seconds, nm^2, over pieces of this length.
+fn pieces_nm2(errors: &[(f64, f64)], piece_s: f64, period_s: f64) -> Vec<f64> {
+    let from_s = errors.first().map_or(0.0, |first| first.0) + 2.0;
+    let counted: Vec<f64> = (errors.iter().filter(|(time_s, _)| *time_s >= from_s))
+        .map(|(_, um)| 1e6 * um * um)
+        .collect();
+    let rows = ((piece_s / period_s).round() as usize).max(1);
+    (counted.chunks_exact(rows))
+        .map(|piece| piece.iter().sum::<f64>() / rows as f64)
+        .collect()
+}
+
 fn tracked(
     mut prepared: Prepared,
     on: &OnRig,
@@ -258,6 +273,10 @@ fn tracked(
     reference: ReferenceSpec,
     duration_s: f64,
 ) -> Result<Tracked, Failure> {
+    let piece_s = match reference {
+        ReferenceSpec::Sine { frequency_hz, .. } => (1.0 / frequency_hz).max(0.1),
+        _ => 0.1,
+    };
     let file = RigFile {
         timing,
         ..on.file.clone()
@@ -286,6 +305,7 @@ fn tracked(
         ended: finished.ended.to_string(),
         rms_measured_nm: finished.summary.rms_measured_nm,
         rms_true_nm: finished.summary.rms_true_nm,
+        pieces_nm2: pieces_nm2(&errors, piece_s, timing.period_us * 1e-6),
         trace: errors[last..].iter().copied().unzip(),
     })
 }

@@ -95,4 +95,25 @@ pub(super) fn answer(r: &mut Report, result: &Reconciliation) {
         ),
     };
     r.result(status, &format!("{text} {text_of_gap}"));
+    r.certainty(&sure(result));
+}
+
+/// How sure the answer is.
+fn sure(result: &Reconciliation) -> String {
+    let least = result.effects.iter().map(|e| e.p_value).reduce(f64::max);
+    let chance = least.map_or_else(String::new, |p| {
+        let p = super::p_value(p);
+        let p = match p.strip_prefix("< ") {
+            Some(less) => format!("below {less}"),
+            None => p,
+        };
+        format!("The probability that chance made what was found, in the whole search, is {p}. Intervals are those of the fit. ")
+    });
+    let floor = match result.floor.is_known() {
+        true => "The noise floor is known from the records or the model",
+        false => "The noise floor is what the fit leaves, as no record tells it",
+    };
+    format!(
+        "{chance}Prediction errors (RMS, one sample ahead) are of parts of the records that the fit had not seen. {floor}."
+    )
 }

@@ -347,26 +347,47 @@ fn gap(r: &mut Report, result: &Reconciliation) {
 fn innovations(r: &mut Report, result: &Reconciliation) {
     let g = &result.gap;
     let (factor, unit) = fine(result);
-    let x: Vec<f64> = g
-        .bands
-        .iter()
-        .map(|b| (b.low_hz.max(0.3) * b.high_hz).sqrt())
+    let whole_hz = g.bands.last().map_or(1.0, |band| band.high_hz);
+    let names: Vec<String> = (g.bands.iter())
+        .map(|band| format!("{}\u{2013}{}", band.low_hz, band.high_hz))
         .collect();
-    let pick = |f: fn(&crate::verdict::result::BandGap) -> f64| {
-        g.bands.iter().map(|b| factor * f(b)).collect::<Vec<f64>>()
+    let at = |side: f64| {
+        (0..names.len())
+            .map(|n| n as f64 + side)
+            .collect::<Vec<f64>>()
+    };
+    // A band's share of the whole: the squares of all bands add up to the square of the whole.
+    let share = |f: fn(&crate::verdict::result::BandGap) -> f64| {
+        let of = |band| {
+            let band: &crate::verdict::result::BandGap = band;
+            factor * f(band) * ((band.high_hz - band.low_hz) / whole_hz).sqrt()
+        };
+        g.bands.iter().map(of).collect::<Vec<f64>>()
+    };
+    let whole = |f: fn(&crate::verdict::result::BandGap) -> f64| {
+        let squares: f64 = share(f).iter().map(|part| part * part).sum();
+        format!("{} {unit}", figure(squares.sqrt()))
     };
     r.figure(
         Figure::new(
             "spectrum",
-            "Prediction error (innovation) by frequency band on held-out records, of the model as it was and with the effects added; dashed: \
-             the noise floor of these records.").panel(
+            &format!(
+                "Where the prediction error is: its part in each frequency band, of the model as it was and with the effects added, and the part \
+                 that noise alone has (points; by chance a band is a little below it). The squares of the parts add up to the square of the \
+                 whole: {} before, {} after, {} of noise, of all records together.",
+                whole(|b| b.before),
+                whole(|b| b.after),
+                whole(|b| b.floor)
+            ),
+        )
+        .panel(
             Panel::new(
-                Axis::log("frequency", "Hz"),
-                Axis::log("innovation", &format!("{unit} RMS")),
+                Axis::categories("frequency band (Hz)", &names),
+                Axis::linear("prediction error", &format!("{unit} RMS")),
             )
-            .series(Series::line("before", &x, &pick(|b| b.before)))
-            .series(Series::line("after", &x, &pick(|b| b.after)))
-            .series(Series::line("floor", &x, &pick(|b| b.floor)).dashed()),
+            .series(Series::bars("before", &at(-0.2), &share(|b| b.before), 0.38))
+            .series(Series::bars("after", &at(0.2), &share(|b| b.after), 0.38))
+            .series(Series::points("noise alone", &at(0.2), &share(|b| b.floor)).color(7)),
         ),
     );
 }

@@ -11,7 +11,7 @@ pub struct Mean {
     pub cycles: u64,
     /// The mean.
     pub mean: f64,
-    /// Half width of its 95 % interval, from their scatter (Student's t).
+    /// Half width of its 95 % interval, from their scatter about a straight line (Student's t).
     pub ci95: f64,
 }
 
@@ -43,7 +43,7 @@ impl Trend {
 }
 
 /// Student's t for a two-sided 95 % interval.
-fn student95(freedom: usize) -> f64 {
+pub fn student95(freedom: usize) -> f64 {
     const TABLE: [f64; 10] = [
         12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
     ];
@@ -54,15 +54,22 @@ fn student95(freedom: usize) -> f64 {
         .unwrap_or_else(wide)
 }
 
-fn mean_of(points: &[(f64, f64)]) -> Mean {
-    let n = points.len() as f64;
-    let mean = points.iter().map(|p| p.1).sum::<f64>() / n;
-    let squares: f64 = points.iter().map(|p| (p.1 - mean).powi(2)).sum();
-    let freedom = points.len().saturating_sub(1);
-    Mean {
-        cycles: points.len() as u64,
-        mean,
-        ci95: student95(freedom) * (squares / freedom.max(1) as f64 / n).sqrt(),
+impl Mean {
+    /// Of `(cycle, value)` points, at least one. A steady change within them is no scatter: the interval is of the scatter about
+    /// their straight line. Three points say too little about a line: of them it is the scatter about the mean.
+    pub fn of(points: &[(f64, f64)]) -> Self {
+        let n = points.len() as f64;
+        let mean = points.iter().map(|p| p.1).sum::<f64>() / n;
+        let about_mean: f64 = points.iter().map(|p| (p.1 - mean).powi(2)).sum();
+        let (squares, freedom) = match line(points).filter(|_| points.len() > 3) {
+            Some((.., about_line)) => (about_line, points.len() - 2),
+            None => (about_mean, points.len().saturating_sub(1)),
+        };
+        Self {
+            cycles: points.len() as u64,
+            mean,
+            ci95: student95(freedom) * (squares / freedom.max(1) as f64 / n).sqrt(),
+        }
     }
 }
 
@@ -101,8 +108,8 @@ pub fn trend(values: impl IntoIterator<Item = (u64, f64)>) -> Option<Trend> {
     let ends = ENDS.min(points.len() / 2);
     Some(Trend {
         cycles: points.len() as u64,
-        first: mean_of(&points[..ends]),
-        last: mean_of(&points[points.len() - ends..]),
+        first: Mean::of(&points[..ends]),
+        last: Mean::of(&points[points.len() - ends..]),
         per_cycle,
         ci95_per_cycle,
         residual: (sum / points.len() as f64).sqrt(),
@@ -272,6 +279,28 @@ mod tests {
             flat.saturating.is_none_or(|law| !law.better_than_line),
             "{flat:?}"
         );
+    }
+
+    /// Of ten cycles of a steady change the mean is known as well as its scatter allows: the change is no scatter.
+    #[test]
+    fn the_interval_of_a_mean_leaves_a_steady_change_out() {
+        let (mut inside, mut widest) = (0, 0.0_f64);
+        for draw in 0..400 {
+            // The sum of twelve even values has a standard deviation of one.
+            let scatter = |k: u64| {
+                (0..12)
+                    .map(|n| noise(12 * (10 * draw + k) + n))
+                    .sum::<f64>()
+            };
+            let points: Vec<(f64, f64)> = (0..10)
+                .map(|k| (k as f64, 5.0 * k as f64 + scatter(k)))
+                .collect();
+            let found = Mean::of(&points);
+            inside += u64::from((found.mean - 22.5).abs() < found.ci95);
+            widest = widest.max(found.ci95);
+        }
+        assert!((368..=392).contains(&inside), "{inside} of 400");
+        assert!(widest < 2.0, "{widest}: the change of 45 is in it");
     }
 
     #[test]

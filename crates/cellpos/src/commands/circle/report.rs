@@ -1,10 +1,11 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
+use crate::commands::report::{half95, with_interval};
 use crate::output::command_line;
 use cellpos_experiment::circle::Circle;
 use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use cellpos_experiment::circle::stage::{Stage, Tracked};
-use cellpos_reconcile::Reconciliation;
+use cellpos_reconcile::{Reconciliation, Verdict};
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use std::path::Path;
 
@@ -114,15 +115,50 @@ fn bode(circle: &Circle) -> Figure {
 /// One of a stage's two runs.
 type OfStage = fn(&Stage) -> Option<&Tracked>;
 
+const RUNS: [(&str, OfStage); 2] = [
+    ("holding", |s| s.hold.as_ref()),
+    ("on the sine", |s| s.sine.as_ref()),
+];
+
+/// RMS error of a run and half its 95 % interval, nm.
+fn error(tracked: &Tracked) -> Option<(f64, f64)> {
+    let nm = tracked.rms_true_nm.or(tracked.rms_measured_nm)?;
+    Some((nm, half95(&tracked.pieces_nm2) / (2.0 * nm)))
+}
+
+/// The error of each controller in both runs.
+fn errors(circle: &Circle) -> Figure {
+    let mut plot = Figure::new(
+        "errors",
+        "RMS error with the controller designed on each model, with its 95 % interval where that is larger than the point.",
+    )
+    .columns(2);
+    let names: Vec<&str> = circle.stages.iter().map(|stage| stage.name).collect();
+    let at: Vec<f64> = (0..names.len()).map(|n| n as f64).collect();
+    for (title, of) in RUNS {
+        let found: Vec<(f64, f64)> = (circle.stages.iter())
+            .map(|stage| of(stage).and_then(error).unwrap_or((f64::NAN, f64::NAN)))
+            .collect();
+        let of =
+            |sign: f64| -> Vec<f64> { found.iter().map(|(nm, half)| nm + sign * half).collect() };
+        let axis = Axis::categories("controller designed on the model", &names);
+        plot = plot.panel(
+            Panel::new(axis, Axis::linear("error", "nm RMS"))
+                .title(title)
+                .series(Series::intervals("", &at, &of(0.0), &of(-1.0), &of(1.0)).color(0)),
+        );
+    }
+    plot
+}
+
 fn traces(circle: &Circle) -> Figure {
     let mut plot = Figure::new(
         "tracking-errors",
-        "Position less reference in the last half second: holding still, and following the sine.",
+        "Position less reference in the last half second: holding still, and following the sine. On the emulated rig every controller meets \
+         the same noise.",
     )
     .share_x();
-    let kinds: [(&str, OfStage); 2] =
-        [("hold", |s| s.hold.as_ref()), ("sine", |s| s.sine.as_ref())];
-    for (title, of) in kinds {
+    for (title, of) in RUNS {
         let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear("error", "um"))
             .title(title)
             .height_px(180.0);
@@ -146,74 +182,125 @@ fn verdict_and_names(circle: &Circle) -> String {
     format!("{}: {}", verdict.word(), names.join(" + "))
 }
 
-/// What the models of the stages are called.
-fn model_of(stage: &Stage) -> String {
-    match stage.name {
-        "as given" => "the given model".to_owned(),
-        "as identified" => "the identified model".to_owned(),
-        "as reconciled" => "the corrected model".to_owned(),
-        other => other.to_owned(),
+/// The verdict in a sentence.
+fn lacks(circle: &Circle) -> String {
+    let names: Vec<&str> = (circle.reconciled.effects.iter())
+        .map(|effect| effect.id.as_str())
+        .collect();
+    let names = names.join(" and ");
+    match circle.reconciled.verdict {
+        Verdict::Named => format!("What the model lacked was found: {names}."),
+        Verdict::NamedWithRemainder => {
+            format!(
+                "What the model lacked was found in part: {names}, and something without a name."
+            )
+        }
+        Verdict::Ambiguous => format!("The model lacks {names}; these records do not tell which."),
+        Verdict::Unknown => "The model lacks something that no known effect explains.".to_owned(),
+        Verdict::NothingMissing => "The model lacked nothing.".to_owned(),
     }
 }
 
-/// The added effects, with all delays together, and their benefit.
-fn sentence(circle: &Circle) -> String {
-    let mut text = format!("{}.", verdict_and_names(circle));
-    if let Some(first) = text.get(..1) {
-        text = format!("{}{}", first.to_uppercase(), &text[1..]);
-    }
-    let identified_ms = circle.identified.result.judged.model.delay_s * 1e3;
+/// The delay of the loop as identified and as reconciled, both from the middle of an exposure to the tick that uses it, ms.
+fn delays(circle: &Circle) -> Option<String> {
+    let identified = (circle.identified.result.judged.parameters.iter())
+        .find(|parameter| parameter.name == "effective_delay_ms")?;
     let added = (circle.reconciled.effects.iter())
-        .filter(|effect| effect.id == "time-delay")
-        .find_map(|effect| effect.parameters.get("delay_s"));
-    if let Some(added) = added {
-        let [value, low, high] = [added.value, added.ci95[0], added.ci95[1]].map(|s| s * 1e3);
-        text.push_str(&format!(
-            " Delays that belong together: {identified_ms:.2} ms identified in the loop, {value:.2} ms (95 %: {low:.2} to {high:.2}) added to \
-             a model without it."
-        ));
+        .find(|effect| effect.id == "time-delay")?
+        .parameters
+        .get("delay_s")?;
+    let stage = circle.stages.last()?;
+    // Half the exposure comes on top of what was added.
+    let rest_ms = stage.delay_ms - 1e3 * added.value;
+    let [low, high] = added.ci95.map(|s| 1e3 * s + rest_ms);
+    let [from, to] = identified.ci95;
+    Some(format!(
+        " Delay from a frame's exposure to its use: {:.3} ms identified (95 %: {from:.3} to {to:.3}), {:.3} ms reconciled (95 %: {low:.3} \
+         to {high:.3}).",
+        identified.value, stage.delay_ms
+    ))
+}
+
+/// What the correction was worth in one run, and the sign of a change beyond chance.
+fn worth(first: &Stage, last: &Stage, name: &str, of: OfStage) -> (String, i8) {
+    let said = |stage: &Stage| match of(stage).and_then(error) {
+        Some((nm, half)) if of(stage).is_some_and(|run| run.state == "running") => {
+            format!("{} nm", with_interval(nm, half))
+        }
+        _ => rms(of(stage)),
+    };
+    let sign = match (of(first).and_then(error), of(last).and_then(error)) {
+        (Some(before), Some(after)) if (after.0 - before.0).abs() > before.1.hypot(after.1) => {
+            if after.0 < before.0 {
+                1
+            } else {
+                -1
+            }
+        }
+        _ => 0,
+    };
+    (
+        format!("{} before, {} after {name}", said(first), said(last)),
+        sign,
+    )
+}
+
+/// What came out.
+fn sentence(circle: &Circle) -> (Emphasis, String) {
+    let mut text = lacks(circle);
+    if let Some(delays) = delays(circle) {
+        text.push_str(&delays);
     }
+    let mut gain = 0;
     if let [first, .., last] = circle.stages.as_slice() {
-        let of = |stage: &Stage| {
-            format!(
-                "{} on the sine, {} holding",
-                rms(stage.sine.as_ref()),
-                rms(stage.hold.as_ref())
-            )
+        let (runs, signs): (Vec<String>, Vec<i8>) = RUNS
+            .iter()
+            .map(|(name, of)| worth(first, last, name, *of))
+            .unzip();
+        gain = signs.iter().sum();
+        let worse = signs.iter().any(|sign| *sign < 0);
+        let verdict = match (gain, worse) {
+            (1.., false) => "The controller of the corrected model is better",
+            (_, true) if gain < 0 => "The controller of the corrected model is worse",
+            (_, true) => {
+                "The controller of the corrected model is better in one run and worse in the other"
+            }
+            _ => "The controller of the corrected model gains nothing",
         };
-        text.push_str(&format!(
-            " RMS errors (one run each): {} with the controller of {}; {} with that of {}.",
-            of(first),
-            model_of(first),
-            of(last),
-            model_of(last)
-        ));
+        text.push_str(&format!(" {verdict}: RMS error {}.", runs.join(", ")));
     }
-    text
+    let status = match circle.reconciled.verdict {
+        Verdict::Unknown => Emphasis::Bad,
+        Verdict::Ambiguous => Emphasis::Warning,
+        _ if gain > 0 => Emphasis::Good,
+        _ => Emphasis::Plain,
+    };
+    (status, text)
 }
 
 /// The page.
 pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
-    let status = match circle.reconciled.verdict {
-        cellpos_reconcile::Verdict::Unknown => Emphasis::Bad,
-        cellpos_reconcile::Verdict::Ambiguous => Emphasis::Warning,
-        _ => Emphasis::Good,
-    };
     let m = circle.motion;
     r.lead(&format!(
-        "Task: measure the plant of {}, name what the model lacks, design the controller again on the corrected model, and compare. With \
-         each controller the bead was held for {} s, and moved on a sine of {} um to each side at {} Hz.",
+        "Task: measure how the bead follows the piezo of {}, find what the model lacks, design the controller again on the corrected model, \
+         and compare. With each controller the bead was held for {} s, then moved on a sine of {} um to each side at {} Hz for {} s.",
         match circle.truth {
             Some(_) => "the emulated rig (a simulation)",
             None => "the rig",
         },
         m.duration_s,
         m.amplitude_um,
-        m.frequency_hz
+        m.frequency_hz,
+        m.duration_s
     ));
-    r.result(status, &sentence(circle));
-    r.figure(traces(circle));
+    let (status, sentence) = sentence(circle);
+    r.result(status, &sentence);
+    r.certainty(
+        "\u{b1} is the 95 % interval that one run of each gives, from the scatter of its error over tenths of a second; the first two seconds \
+         are left out. Before: the controller of the given model; after: that of the corrected one. Intervals of a delay: 95 % of the fit.",
+    );
+    r.figure(errors(circle));
 
     r.section("Identified");
     let model = &circle.identified.result.judged.model;
@@ -345,6 +432,7 @@ fn tracking(r: &mut Report, circle: &Circle) {
         m.duration_s, m.amplitude_um, m.frequency_hz
     ));
     r.table(t);
+    r.figure(traces(circle));
 }
 
 fn margins_table(circle: &Circle) -> Table {

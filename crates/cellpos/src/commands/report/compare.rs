@@ -3,7 +3,7 @@
 mod data;
 mod shown;
 
-use super::cycles::{half95, with_interval};
+use super::cycles::{digits_of, half95, with_interval};
 use super::session::folder_name;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
 use cellpos_report::{Emphasis, Report};
@@ -73,25 +73,36 @@ fn page(compared: &[Compared]) -> (Report, String) {
         .iter()
         .filter_map(|arm| of_an_arm(compared, *arm, quantities))
         .collect();
+    let sure = match (parts.is_empty(), compared.len()) {
+        (true, _) => {
+            "\u{b1} is the 95 % interval of each run, from its own length. Errors have the noise of the camera in them.".to_owned()
+        }
+        (false, 1) => "\u{b1} is the 95 % interval within this one run.".to_owned(),
+        (false, n) => format!(
+            "\u{b1} is the 95 % interval of the mean of {n} runs, from how they differ (Student's t); first and last: ten cycles of each \
+             run. Runs of one sample that are alike tell nothing about other samples."
+        ),
+    };
     if parts.is_empty() {
         parts.extend(of_holds(compared));
-    } else if compared.len() > 1 {
-        parts.push("Intervals: 95 %, between runs.".to_owned());
     }
     let done = compared
         .iter()
         .filter(|run| run.emphasis == Emphasis::Good)
         .count();
-    parts.push(match done == compared.len() {
-        true => "All runs came to their end.".to_owned(),
-        false => format!("{done} of {} runs came to their end.", compared.len()),
-    });
+    if done < compared.len() {
+        parts.push(format!(
+            "{done} of {} runs came to their end.",
+            compared.len()
+        ));
+    }
     let sentence = parts.join(" ");
     let status = match done == compared.len() {
         true => Emphasis::Good,
         false => Emphasis::Warning,
     };
     page.result(status, &sentence);
+    page.certainty(&sure);
     page.figure(match quantities.is_empty() {
         true => errors(compared),
         false => over_cycles(compared, quantities),
@@ -160,28 +171,31 @@ fn of_an_arm(compared: &[Compared], arm: ArmKind, quantities: &[Quantity]) -> Op
                     let values: Vec<f64> = many.iter().map(|ends| of(ends)).collect();
                     (values.iter().sum::<f64>() / count, half95(&values))
                 };
-                let (first, last) = (mean(&|ends| ends.first), mean(&|ends| ends.last));
+                let (first, last) = (mean(&|ends| ends.first).0, mean(&|ends| ends.last).0);
                 let (change, ci95) = mean(&|ends| ends.last - ends.first);
-                let sure = match change.abs() > ci95 {
-                    true => format!("change {}", with_interval(change, ci95)),
-                    false => "no change beyond the scatter between runs".to_owned(),
-                };
-                format!(
-                    "{} from {} to {}{unit} ({sure})",
-                    quantity.name,
-                    with_interval(first.0, first.1),
-                    with_interval(last.0, last.1)
-                )
+                let changed = with_interval(change.abs(), ci95);
+                let digits = digits_of(ci95);
+                match change.abs() > ci95 {
+                    true => format!(
+                        "{} {} by {changed}{unit}, from {first:.digits$} to {last:.digits$}{unit}",
+                        quantity.name,
+                        if change < 0.0 { "fell" } else { "rose" },
+                    ),
+                    false => format!(
+                        "{} was {first:.digits$} at first and {last:.digits$}{unit} at last, no change beyond the scatter between runs (\u{b1}\u{a0}{ci95:.digits$}{unit})",
+                        quantity.name
+                    ),
+                }
             }
         };
         said.push(text);
     }
     let of = match (most, arm) {
         (0, _) => return None,
-        (1, ArmKind::Cyclic) => "Cyclic arm of one run".to_owned(),
-        (1, ArmKind::Static) => "Static arm of one run".to_owned(),
-        (n, ArmKind::Cyclic) => format!("Cyclic arm, mean of {n} runs"),
-        (n, ArmKind::Static) => format!("Static arm, mean of {n} runs"),
+        (1, ArmKind::Cyclic) => "Over the cycles of one run".to_owned(),
+        (1, ArmKind::Static) => "Under a static load, in one run".to_owned(),
+        (n, ArmKind::Cyclic) => format!("Over the cycles, mean of {n} runs"),
+        (n, ArmKind::Static) => format!("Under a static load, mean of {n} runs"),
     };
     Some(format!("{of}: {}.", said.join(", ")))
 }
@@ -261,10 +275,13 @@ mod tests {
             run("e", ArmKind::Static, -0.001),
         ];
         let cyclic = of_an_arm(&study, ArmKind::Cyclic, &CELL).unwrap();
-        assert!(cyclic.starts_with("Cyclic arm, mean of 3 runs"), "{cyclic}");
+        assert!(
+            cyclic.starts_with("Over the cycles, mean of 3 runs"),
+            "{cyclic}"
+        );
         // Thirty cycles lie between the middles of the first and the last ten.
         assert!(
-            cyclic.contains("change -0.300\u{a0}±\u{a0}0.075"),
+            cyclic.contains("fell by 0.300\u{a0}±\u{a0}0.075 s, from 3."),
             "{cyclic}"
         );
         let fixed = of_an_arm(&study, ArmKind::Static, &CELL).unwrap();

@@ -1,7 +1,7 @@
 //! The cycles of a run: trends of each motion, and the static arm.
 
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, student95, trend};
 use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
@@ -307,11 +307,7 @@ pub(super) fn short(value: f64) -> String {
 
 /// A value with an interval, to the digits that the interval leaves it.
 pub(crate) fn with_interval(value: f64, ci95: f64) -> String {
-    let digits = if ci95 > 0.0 && ci95.is_finite() {
-        (1.0 - ci95.log10().floor()).clamp(0.0, 9.0) as usize
-    } else {
-        4
-    };
+    let digits = digits_of(ci95);
     if !ci95.is_finite() {
         return format!("{value:.digits$} (no interval)");
     }
@@ -319,22 +315,23 @@ pub(crate) fn with_interval(value: f64, ci95: f64) -> String {
     format!("{value:.digits$}\u{a0}±\u{a0}{ci95:.digits$}")
 }
 
+/// Decimals that an interval leaves a value.
+pub(crate) fn digits_of(ci95: f64) -> usize {
+    match ci95 > 0.0 && ci95.is_finite() {
+        true => (1.0 - ci95.log10().floor()).clamp(0.0, 9.0) as usize,
+        false => 4,
+    }
+}
+
 /// Half the width of the 95 % interval of a mean, by Student's t.
 pub(crate) fn half95(values: &[f64]) -> f64 {
-    const TABLE: [f64; 10] = [
-        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
-    ];
     let n = values.len();
     if n < 2 {
         return f64::NAN;
     }
     let mean = values.iter().sum::<f64>() / n as f64;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    let t = TABLE
-        .get(n - 2)
-        .copied()
-        .unwrap_or(1.96 + 2.5 / (n - 1) as f64);
-    t * (squares / (n - 1) as f64 / n as f64).sqrt()
+    student95(n - 1) * (squares / (n - 1) as f64 / n as f64).sqrt()
 }
 
 fn trend_json(quantity: &Quantity, group: &Group, found: &Trend) -> serde_json::Value {

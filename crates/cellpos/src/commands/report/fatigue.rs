@@ -3,7 +3,7 @@
 use super::cycles::{on_the_way, was_elsewhere};
 use super::ticks::{Course, Ticks};
 use cellpos_report::{Axis, Figure, Panel, Report, Series};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Mean};
 
 /// The cycles that are drawn over each other: the first, the tenth, the hundredth, ... and the last one with records.
 pub(super) fn courses(rows: &[CycleRow]) -> Vec<Course> {
@@ -45,18 +45,14 @@ pub(super) fn is_whole(row: &&CycleRow) -> bool {
 /// Means of ten cycles each with their 95 % intervals: cycle, mean, low, high.
 pub(super) fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
     const TEN: usize = 10;
-    // Student's t for nine degrees of freedom.
-    const T95: f64 = 2.262;
     let mut columns: [Vec<f64>; 4] = Default::default();
     for ten in values.chunks(TEN).filter(|ten| ten.len() == TEN) {
-        let n = TEN as f64;
-        let mean = |of: fn(&(f64, f64)) -> f64| ten.iter().map(of).sum::<f64>() / n;
-        let (cycle, value) = (mean(|p| p.0), mean(|p| p.1));
-        let squares: f64 = ten.iter().map(|p| (p.1 - value).powi(2)).sum();
-        let half = T95 * (squares / (n - 1.0) / n).sqrt();
+        let cycle = ten.iter().map(|p| p.0).sum::<f64>() / TEN as f64;
+        let found = Mean::of(ten);
+        let ends = [found.mean - found.ci95, found.mean + found.ci95];
         for (column, value) in columns
             .iter_mut()
-            .zip([cycle, value, value - half, value + half])
+            .zip([cycle, found.mean, ends[0], ends[1]])
         {
             column.push(value);
         }
@@ -118,85 +114,115 @@ pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     }
 }
 
+/// Why the first length differs from the others.
+pub(crate) const OF_FIRST_LENGTH: &str = "The first cycle begins with the cell at rest; before each later one the pause leaves some of the stretch.";
+
 /// Change of the cell over the cycles: the main figure of a run with a cell.
 pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
     let rest = AtRest::of(rows);
     if rest.length_um.is_nan() {
         return None;
     }
-    let of = |arm: ArmKind, value: &dyn Fn(&CycleRow) -> f64| -> Vec<(f64, f64)> {
-        rows.iter()
-            .filter(|row| row.arm == arm && !on_the_way(row) && !was_elsewhere(row))
-            .filter(|row| !row.flags.has(CycleFlags::SKIPPED) && !row.flags.has(CycleFlags::RAMP))
-            .map(|row| (row.cycle as f64 + 1.0, value(row)))
-            .filter(|(_, value)| value.is_finite())
-            .collect()
-    };
-    let elsewhere = |value: &dyn Fn(&CycleRow) -> f64| -> (Vec<f64>, Vec<f64>) {
-        (rows.iter().filter(|row| was_elsewhere(row)))
-            .map(|row| (row.cycle as f64 + 1.0, value(row)))
-            .filter(|(_, value)| value.is_finite())
-            .unzip()
-    };
     let of_arm = |arm: ArmKind| {
         rows.iter()
             .filter(move |row| row.arm == arm)
             .map(|row| row.cycle)
     };
-    let same_cell = match (of_arm(ArmKind::Cyclic).min(), of_arm(ArmKind::Static).min()) {
+    let (cyclic, fixed) = (of_arm(ArmKind::Cyclic).min(), of_arm(ArmKind::Static).min());
+    let same_cell = match (cyclic, fixed) {
         (Some(cyclic), Some(fixed)) if cyclic < fixed => {
-            " Both arms are of this one run: the static arm is of the cell that went through the cycles, not of a fresh one."
+            " Both parts are of this one run: under the static load is the cell that went through the cycles, not a fresh one."
         }
         (Some(_), Some(_)) => {
-            " Both arms are of this one run: the cycles are of the cell that was under the static load before."
+            " Both parts are of this one run: the cycles are of the cell that was under the static load before."
         }
         _ => "",
     };
-    let mut figure = Figure::new(
+    let figure = Figure::new(
         "fatigue",
         &format!(
-            "Stretch, length at the start and recovery time of every cycle (small points), and of ten cycles in the mean (large) with \
-             the 95 % interval of that mean, where it is larger than the point.{same_cell}"
+            "Small points: each cycle (under the static load: as long as a cycle). Large: means of ten with their 95 % interval, where \
+             it is larger than the point. {OF_FIRST_LENGTH}{same_cell}"
         ),
     );
-    type Value<'v> = &'v dyn Fn(&CycleRow) -> f64;
-    let quantities: [(&str, &str, Value); 3] = [
-        ("stretch", "", &|row| rest.stretch(row)),
-        ("length at start", "um", &|row| row.length_start_um),
-        ("recovery time", "s", &|row| row.recovery_s),
+    let mut panels = vec![
+        panel(rows, ArmKind::Cyclic, "stretch", "", &|row| {
+            rest.stretch(row)
+        }),
+        panel(rows, ArmKind::Cyclic, "recovery time", "s", &|row| {
+            row.recovery_s
+        }),
     ];
-    for (name, unit, value) in quantities {
-        let mut panel =
-            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(150.0);
-        for (color, arm, label) in [
-            (0, ArmKind::Cyclic, "cyclic"),
-            (1, ArmKind::Static, "static"),
-        ] {
-            let points = of(arm, value);
-            if points.is_empty() {
-                continue;
-            }
-            let (x, y): (Vec<f64>, Vec<f64>) = points.iter().copied().unzip();
-            let [cycle, mean, low, high] = tens(&points);
-            if cycle.is_empty() {
-                panel = panel.series(Series::points(label, &x, &y).color(color));
-            } else {
-                panel = panel
-                    .series(Series::points("", &x, &y).color(color).thin())
-                    .series(Series::intervals(label, &cycle, &mean, &low, &high).color(color));
-            }
-        }
-        let (x, y) = elsewhere(value);
-        if !x.is_empty() {
-            panel = panel.series(
-                Series::points("elsewhere, in no mean", &x, &y)
-                    .color(7)
-                    .thin(),
-            );
-        }
-        figure = figure.panel(panel);
+    if fixed.is_some() {
+        panels.push(panel(rows, ArmKind::Static, "stretch", "", &|row| {
+            rest.stretch(row)
+        }));
     }
-    Some(figure.share_x())
+    panels.push(panel(
+        rows,
+        ArmKind::Cyclic,
+        "length at start",
+        "um",
+        &|row| row.length_start_um,
+    ));
+    Some(panels.into_iter().fold(figure.columns(2), Figure::panel))
+}
+
+/// A quantity of one arm: over the cycles, or over the time under the static load.
+fn panel(
+    rows: &[CycleRow],
+    arm: ArmKind,
+    name: &str,
+    unit: &str,
+    value: &dyn Fn(&CycleRow) -> f64,
+) -> Panel {
+    let first = rows
+        .iter()
+        .filter(|row| row.arm == arm)
+        .map(|row| row.cycle)
+        .min();
+    let (x, title, color) = match arm {
+        ArmKind::Cyclic => (Axis::linear("cycle", ""), "over the cycles", 0),
+        ArmKind::Static => (
+            Axis::linear("time under static load", "s"),
+            "at rest under static load",
+            1,
+        ),
+    };
+    let place = |row: &CycleRow| match arm {
+        ArmKind::Cyclic => row.cycle as f64 + 1.0,
+        ArmKind::Static => (row.cycle - first.unwrap_or(0)) as f64 * row.duration_s,
+    };
+    let of = |wanted: &dyn Fn(&CycleRow) -> bool| -> Vec<(f64, f64)> {
+        (rows.iter().filter(|row| row.arm == arm && wanted(row)))
+            .map(|row| (place(row), value(row)))
+            .filter(|(_, value)| value.is_finite())
+            .collect()
+    };
+    let mut panel = Panel::new(x, Axis::linear(name, unit))
+        .title(title)
+        .height_px(170.0);
+    let counts = |row: &CycleRow| {
+        !on_the_way(row)
+            && !was_elsewhere(row)
+            && !row.flags.has(CycleFlags::SKIPPED)
+            && !row.flags.has(CycleFlags::RAMP)
+    };
+    let points = of(&counts);
+    let (x, y): (Vec<f64>, Vec<f64>) = points.iter().copied().unzip();
+    let [at, mean, low, high] = tens(&points);
+    panel = panel.series(Series::points("", &x, &y).color(color).thin());
+    panel = panel.series(Series::intervals("", &at, &mean, &low, &high).color(color));
+    let elsewhere = of(&was_elsewhere);
+    if !elsewhere.is_empty() {
+        let (x, y): (Vec<f64>, Vec<f64>) = elsewhere.into_iter().unzip();
+        panel = panel.series(
+            Series::points("elsewhere, in no mean", &x, &y)
+                .color(7)
+                .thin(),
+        );
+    }
+    panel
 }
 
 #[cfg(test)]
@@ -221,14 +247,19 @@ mod tests {
     }
 
     #[test]
-    fn means_of_ten_have_the_interval_of_a_mean() {
+    fn means_of_ten_have_the_interval_of_their_scatter_about_a_line() {
+        // To and fro about a ramp: the ramp is no scatter, and what is left over is in no mean.
         let values: Vec<(f64, f64)> = (0..25)
-            .map(|k| (f64::from(k), if k % 2 == 0 { 1.0 } else { 3.0 }))
+            .map(|k| {
+                let to_and_fro = if (k + 1) % 4 < 2 { 1.0 } else { -1.0 };
+                (f64::from(k), 100.0 * f64::from(k) + to_and_fro)
+            })
             .collect();
         let [cycle, mean, low, high] = tens(&values);
-        assert_eq!((cycle.len(), cycle[0], mean[1]), (2, 4.5, 2.0));
-        // Scatter of sqrt(10 / 9) over sqrt(10), times t.
-        let half = 2.262 / 3.0;
-        assert!((high[0] - 2.0 - half).abs() < 1e-9 && (2.0 - low[0] - half).abs() < 1e-9);
+        assert_eq!((cycle.len(), cycle[0]), (2, 4.5));
+        assert!((mean[1] - 1450.0).abs() < 0.5, "{mean:?}");
+        // A scatter of some sqrt(10 / 8) over sqrt(10), times t of eight degrees of freedom, 2.306.
+        let half = (high[0] - low[0]) / 2.0;
+        assert!((half - 2.306 / 8.0_f64.sqrt()).abs() < 0.05, "{half}");
     }
 }

@@ -6,10 +6,16 @@ use super::origin;
 use super::ticks::Ticks;
 use super::traces;
 use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
-use cellpos_script::{ArmKind, AtRest, CycleRow, Trend, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use cellpos_session::connect::ENDED;
 
-/// Adds the sentence, and the figure unless the cycles of a cell have one; returns the sentence.
+/// What came out, and how sure it is.
+pub(super) struct Said {
+    pub(super) result: String,
+    sure: String,
+}
+
+/// Adds the sentences, and the figure unless the cycles of a cell have one; returns the result's.
 pub(super) fn section(
     page: &mut Report,
     sessions: &[Session],
@@ -24,33 +30,51 @@ pub(super) fn section(
         counted(sessions, "frames_lost"),
         counted(sessions, "fixes_lost"),
     );
-    let mut sentence = of_a_cell(rows)
-        .or_else(|| of_waves(rows, what))
-        .or_else(|| of_cycles(rows, what))
+    let Said {
+        mut result,
+        mut sure,
+    } = of_a_cell(rows)
+        .or_else(|| of_waves(rows, bound, what))
+        .or_else(|| of_cycles(rows, bound, what))
         .or_else(|| of_a_hold(ticks, bound, what, ended.is_none()))
-        .unwrap_or_else(|| {
-            "The loop was not closed long enough for an error to be stated.".to_string()
+        .unwrap_or_else(|| Said {
+            result: "The loop was not closed long enough for an error to be stated.".to_string(),
+            sure: String::new(),
         });
     if let Some((before_um, after_um)) = learned {
-        sentence.push_str(&format!(
-            " With learning: {} nm over the first few cycles, {} nm over the last few.",
+        result.push_str(&format!(
+            " Learning brought it from {} nm in the first few cycles to {} nm in the last few.",
             nm(before_um),
             nm(after_um)
         ));
+        sure.push_str(
+            " The two errors of learning are of two cycles or so, and known to some 20 %.",
+        );
     }
-    sentence.push_str(&match lost {
+    result.push_str(&match lost {
         0 => " No frame was lost.".to_string(),
         1 => " One frame was lost.".to_string(),
         many => format!(" {many} frames were lost."),
     });
     if without > 0 {
-        sentence.push_str(&format!(" {without} frames showed no {what}."));
+        result.push_str(&format!(" {without} frames showed no {what}."));
     }
     if let Some(ended) = ended {
-        sentence.push_str(&format!(" The run did not end as planned: {ended}."));
+        result.push_str(&format!(" The run did not end as planned: {ended}."));
     }
-    page.result(status, &sentence);
-    sentence
+    page.result(status, &result);
+    if !sure.is_empty() {
+        page.certainty(&sure);
+    }
+    result
+}
+
+/// What the lowest possible error is, and that it is calculated.
+fn of_bound(bound: &Bound) -> String {
+    format!(
+        " The lowest possible is calculated: what Brownian motion ({} um2/s) does within the delay of the loop.",
+        bound.diffusion_um2_per_s
+    )
 }
 
 /// Whether the run came to its end, and why not.
@@ -101,28 +125,55 @@ fn change(found: &Trend) -> String {
 }
 
 /// A cell over its cycles.
-fn of_a_cell(rows: &[CycleRow]) -> Option<String> {
+fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
     let rest = AtRest::of(rows);
     let Some(stretch) = cyclic(rows, |row| rest.stretch(row)) else {
         return of_few_cycles(rows, &rest);
     };
     let mut text = format!(
-        "The cell's stretch (largest length over that at rest) went {} over {} cycles",
+        "The cell's stretch (largest length over the {:.2} um at rest) went {} over {} cycles",
+        rest.length_um,
         change(&stretch),
         stretch.cycles
     );
     if let Some(recovery) = cyclic(rows, |row| row.recovery_s) {
-        text.push_str(&format!(", its recovery time {} s", change(&recovery)));
+        text.push_str(&format!(
+            ", the time constant of its recovery {} s",
+            change(&recovery)
+        ));
     }
-    text.push_str(&format!(
-        " (means of the first and the last {}, with 95 % intervals).",
+    text.push('.');
+    if let Some(fixed) = trend(under_load(rows).map(|row| (row.cycle, rest.stretch(row)))) {
+        text.push_str(&format!(
+            " At rest under a static load: stretch {}.",
+            change(&fixed)
+        ));
+    }
+    let mut sure = format!(
+        "each number is a mean of the first or the last {} cycles; \u{b1} is its 95 % interval, from the scatter of these cycles about a \
+         straight line.",
         stretch.first.cycles
-    ));
-    Some(text)
+    );
+    let of_rest = 100.0 * rest.stretch_ci95();
+    if of_rest.is_finite() {
+        sure.push_str(&format!(
+            " The length at rest is known to {of_rest:.2} %, alike for every stretch."
+        ));
+    }
+    sure.push_str(" One cell does not tell how cells differ.");
+    Some(Said { result: text, sure })
+}
+
+/// Stretches of time of the static arm, its way to the load and back left out.
+fn under_load(rows: &[CycleRow]) -> impl Iterator<Item = &CycleRow> {
+    let wanted = |row: &&CycleRow| row.arm == ArmKind::Static && !super::cycles::on_the_way(row);
+    rows.iter()
+        .filter(wanted)
+        .filter(|row| !row.flags.has(CycleFlags::SKIPPED))
 }
 
 /// A cell over too few cycles for an interval.
-fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<String> {
+fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<Said> {
     let stretches: Vec<f64> = (rows.iter())
         .filter(super::fatigue::is_whole)
         .filter(|row| !super::cycles::was_elsewhere(row))
@@ -130,69 +181,167 @@ fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<String> {
         .filter(|stretch| stretch.is_finite())
         .collect();
     let (first, last) = (stretches.first()?, stretches.last()?);
-    Some(format!(
-        "The cell's stretch (largest length over that at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles: too few \
-         for an interval.",
-        stretches.len()
-    ))
+    Some(Said {
+        result: format!(
+            "The cell's stretch (largest length over the {:.2} um at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles.",
+            rest.length_um,
+            stretches.len()
+        ),
+        sure: "so few cycles have no interval.".to_string(),
+    })
+}
+
+/// RMS error over cycles with half its 95 % interval, nm.
+fn over_cycles(rows: &[CycleRow]) -> Option<String> {
+    let rms_nm = 1e3 * CycleRow::rms_over_um(rows)?;
+    let squares: Vec<f64> = (rows.iter().map(|row| 1e6 * row.rms_um * row.rms_um))
+        .filter(|square| square.is_finite())
+        .collect();
+    let half_nm = super::half95(&squares) / (2.0 * rms_nm);
+    Some(super::with_interval(rms_nm, half_nm))
+}
+
+/// What the error over cycles is, for [`super::head`].
+pub(super) fn cycles_error(rows: &[CycleRow]) -> Option<String> {
+    (!rows.is_empty()).then(|| over_cycles(rows)).flatten()
+}
+
+/// How sure an error over cycles is.
+fn sure_of_cycles(bound: Option<&Bound>) -> String {
+    format!(
+        "\u{b1} is the 95 % interval, from the scatter between the cycles of this one run. The error is of all cycles, from the first \
+         frame of each to its last, and has the noise of the camera in it.{}",
+        bound.map_or_else(String::new, of_bound)
+    )
+}
+
+fn possible(bound: Option<&Bound>) -> String {
+    bound.map_or_else(String::new, |bound| {
+        format!("; the lowest possible is {:.1} nm", bound.rms_um * 1e3)
+    })
+}
+
+/// The motions of waves: amplitude (um), and reached over commanded amplitude of each of its cycles.
+fn motions(rows: &[CycleRow]) -> Vec<(f64, Vec<f64>)> {
+    let mut found: Vec<(f64, Vec<f64>)> = Vec::new();
+    let whole = rows.iter().filter(super::fatigue::is_whole);
+    for row in whole.filter(|row| !super::cycles::was_elsewhere(row)) {
+        let reached = row.reached_um / row.commanded_um;
+        if !reached.is_finite() {
+            continue;
+        }
+        // Amplitudes are what the script commands, the same within a motion.
+        let same =
+            |(um, _): &&mut (f64, Vec<f64>)| (*um - row.commanded_um).abs() < 1e-3 * um.abs();
+        match found.iter_mut().find(same) {
+            Some((_, values)) => values.push(reached),
+            None => found.push((row.commanded_um, vec![reached])),
+        }
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    found
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
 }
 
 /// A bead over cycles of waves, each with an amplitude of its own.
-fn of_waves(rows: &[CycleRow], what: &str) -> Option<String> {
-    let reached = cyclic(rows, |row| row.reached_um / row.commanded_um)?;
-    let rms = nm(CycleRow::rms_over_um(rows)?);
-    Some(format!(
-        "The {what} reached {} of the commanded amplitude in the first {} of {} cycles, and {} in the last (means with 95 % intervals). \
-         Error: {rms} nm RMS over the cycles.",
-        super::with_interval(reached.first.mean, reached.first.ci95),
-        reached.first.cycles,
-        reached.cycles,
-        super::with_interval(reached.last.mean, reached.last.ci95),
-    ))
+fn of_waves(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said> {
+    /// More amplitudes than this are in the figure alone.
+    const SAID: usize = 5;
+    let reached = motions(rows);
+    let error = over_cycles(rows)?;
+    let cycles: usize = reached.iter().map(|(_, values)| values.len()).sum();
+    let said: Vec<String> = (reached.iter())
+        .map(|(um, values)| {
+            let share = super::with_interval(100.0 * mean(values), 100.0 * super::half95(values));
+            format!("{share} % of {} um", super::cycles::short(*um))
+        })
+        .collect();
+    let shares = match said.as_slice() {
+        [] => return None,
+        [one] => format!("The {what} reached {one}, its commanded amplitude"),
+        some if some.len() <= SAID => {
+            format!(
+                "Of its commanded amplitudes the {what} reached {}",
+                some.join(", ")
+            )
+        }
+        some => format!(
+            "Of its {} commanded amplitudes the {what} reached {} to {}",
+            some.len(),
+            some[0],
+            some[some.len() - 1]
+        ),
+    };
+    Some(Said {
+        result: format!(
+            "{shares} (means of {cycles} cycles). Error: {error} nm RMS{}.",
+            possible(bound)
+        ),
+        sure: sure_of_cycles(bound),
+    })
 }
 
 /// A bead over the cycles of a script. Its steps count, which the error of a hold leaves out.
-fn of_cycles(rows: &[CycleRow], what: &str) -> Option<String> {
-    let rms = nm(CycleRow::rms_over_um(rows)?);
+fn of_cycles(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said> {
+    let error = over_cycles(rows)?;
     let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
     let but = match disturbed {
         0 => String::new(),
         n => format!(", {n} of them disturbed"),
     };
     let cycles = if rows.len() == 1 { "cycle" } else { "cycles" };
-    Some(format!(
-        "The {what} went through {} {cycles}{but}, with an error of {rms} nm RMS over the cycles, steps included.",
-        rows.len()
-    ))
+    Some(Said {
+        result: format!(
+            "The {what} went through {} {cycles}{but}, with an error of {error} nm RMS over the cycles, steps included{}.",
+            rows.len(),
+            possible(bound)
+        ),
+        sure: sure_of_cycles(bound),
+    })
 }
 
 /// A bead that was held, or moved.
-fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>, what: &str, kept: bool) -> Option<String> {
+fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>, what: &str, kept: bool) -> Option<Said> {
     let rms_um = ticks.rms_um()?;
-    let error = match ticks.rms_ci95_um() {
-        Some(ci95_um) => format!(
-            "{} nm RMS (95 % interval)",
-            super::with_interval(1e3 * rms_um, 1e3 * ci95_um)
+    let (error, of_interval) = match ticks.rms_ci95_um() {
+        Some(ci95_um) => (
+            super::with_interval(1e3 * rms_um, 1e3 * ci95_um) + " nm RMS",
+            "\u{b1} is the 95 % interval that so long a piece of this one run gives. ",
         ),
-        None => format!("{} nm RMS", nm(rms_um)),
+        None => (format!("{} nm RMS", nm(rms_um)), ""),
     };
-    let long = duration(ticks.duration_s());
-    let possible = bound.map_or_else(String::new, |bound| {
-        format!("; the lowest possible is {:.1} nm", bound.rms_um * 1e3)
-    });
-    Some(match ticks.motion_rms_um() {
+    let long = duration(ticks.counted_s());
+    let possible = possible(bound);
+    let result = match ticks.motion_rms_um() {
         Some(motion_um) if rms_um < motion_um => format!(
-            "The {what} followed its moving target for {long} with an error of {error}, {:.1} % of the motion.",
+            "The {what} followed its moving target with an error of {error} ({:.1} % of the RMS of the motion) over {long}{possible}.",
             1e2 * rms_um / motion_um
         ),
-        Some(_) => format!("The {what} did not follow its moving target: error {error} in {long}."),
+        Some(_) => format!(
+            "The {what} did not follow its moving target: error {error} over {long}{possible}."
+        ),
         None if kept => {
             format!(
-                "The {what} stayed at its target for {long} with an error of {error}{possible}."
+                "The {what} stayed at its target with an error of {error} over {long}{possible}."
             )
         }
-        None => format!("The {what} was to stay at its target: error {error} in {long}{possible}."),
-    })
+        None => {
+            format!("The {what} was to stay at its target: error {error} over {long}{possible}.")
+        }
+    };
+    let noise_nm = 1e3 * ticks.noise_um();
+    let noise = match noise_nm > 0.0 {
+        true => format!(", with the camera's noise of {noise_nm:.0} nm in it"),
+        false => String::new(),
+    };
+    let sure = format!(
+        "{of_interval}The error is that of the measured position{noise}, from two seconds after the loop was closed.{}",
+        bound.map_or_else(String::new, of_bound)
+    );
+    Some(Said { result, sure })
 }
 
 fn nm(um: f64) -> String {
@@ -214,73 +363,94 @@ fn duration(s: f64) -> String {
 }
 
 /// The error over the run; beside it how it is spread, or the motion.
-pub(super) fn error_figure(ticks: &Ticks, bound: Option<&Bound>, of_a_script: bool) -> Figure {
-    let course = ticks.error.course(0);
-    let mut over_time = Panel::new(Axis::linear("time", "s"), Axis::linear("error", "nm"));
-    let mut caption = "Error: measured position less the target at the time of its exposure, from two seconds after the loop was closed".to_string();
-    if ticks.error.is_bare() {
-        over_time = over_time.series(Series::line("error", &course.time_s, &course.median).thin());
-    } else {
-        over_time = over_time
+pub(super) fn error_figure(ticks: &Ticks, bound: Option<&Bound>, rows: &[CycleRow]) -> Figure {
+    let course = ticks.rms_nm.series("measured").color(0);
+    let mut over_time =
+        Panel::new(Axis::linear("time", "s"), Axis::log("error", "nm RMS")).series(course);
+    let mut caption = format!(
+        "Error: measured position less the target at the time of its exposure, its RMS over each {} s from the closing of the loop on",
+        super::cycles::short(ticks.rms_nm.long_s())
+    );
+    if let Some(bound) = bound {
+        let (ends, at) = ([0.0, ticks.end_s()], [1e3 * bound.rms_um; 2]);
+        over_time = over_time.series(
+            Series::line("lowest possible", &ends, &at)
+                .dashed()
+                .color(1),
+        );
+        caption.push_str("; dashed: the lowest possible over a long time");
+    }
+    let reached = motions(rows);
+    let beside = if ticks.motion_rms_um().is_none() {
+        caption.push_str(". Right: how often each error occurred");
+        spread(ticks, bound, &mut caption)
+    } else if reached.len() > 1 {
+        caption.push_str(". Right: amplitude reached, with the 95 % interval of its mean where that is larger than the point");
+        amplitudes(&reached)
+    } else if rows.is_empty() {
+        caption.push_str(
+            ". Right: the end of the run, each measured position at the time of its exposure",
+        );
+        let end = ticks.last_periods(3.0);
+        Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"))
+            .series(Series::line("target", &end.time_s, &end.target_um).color(1))
             .series(
-                Series::band(
-                    "smallest to largest",
-                    &course.time_s,
-                    &course.low,
-                    &course.high,
-                )
-                .color(0),
-            )
-            .series(
-                Series::line("median", &course.time_s, &course.median)
+                Series::points("measured", &end.time_s, &end.measured_um)
                     .color(0)
                     .thin(),
-            );
-        caption.push_str(" (envelope and median)");
-    }
-    if ticks.motion_rms_um().is_some() {
-        let motion = if of_a_script {
-            caption.push_str(". Left: position and target over the whole run.");
-            traces::position(ticks)
-        } else {
-            let end = ticks.last_periods(3.0);
-            caption.push_str(
-                ". Left: measured position at the end of the run, and the target at the time of each exposure.",
-            );
-            Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"))
-                .series(Series::line("target", &end.time_s, &end.target_um).color(1))
-                .series(
-                    Series::points("measured", &end.time_s, &end.measured_um)
-                        .color(0)
-                        .thin(),
-                )
-        };
-        return Figure::new("error", &caption)
-            .panel(motion)
-            .panel(over_time)
-            .columns(2);
-    }
-    if let Some(bound) = bound {
-        let [low, high] = [-1e3, 1e3].map(|sign| [sign * bound.rms_um; 2]);
-        let ends = [0.0, ticks.end_s()];
-        let line = |name: &str, at: &[f64; 2]| Series::line(name, &ends, at).dashed().color(1);
-        over_time = over_time
-            .series(line("lowest possible RMS", &high))
-            .series(line("", &low));
-        caption.push_str(&format!(
-            "; dashed: the lowest RMS that Brownian motion ({} um2/s), delay and localisation noise allow, {:.1} nm",
-            bound.diffusion_um2_per_s,
-            bound.rms_um * 1e3
-        ));
-    }
-    caption.push_str(". Right: how often each error occurred.");
-    Figure::new("error", &caption)
+            )
+    } else {
+        caption.push_str(". Right: position and target over the whole run");
+        traces::position(ticks)
+    };
+    Figure::new("error", &(caption + "."))
         .panel(over_time)
-        .panel(
-            Panel::new(Axis::linear("error", "nm"), Axis::linear("positions", ""))
-                .series(ticks.error_nm.histogram("", 60).color(0)),
-        )
+        .panel(beside)
         .columns(2)
+}
+
+/// How often each error occurred, and how often it would at the bound.
+fn spread(ticks: &Ticks, bound: Option<&Bound>, caption: &mut String) -> Panel {
+    const BINS: usize = 50;
+    let panel = Panel::new(Axis::linear("error", "nm"), Axis::linear("positions", ""))
+        .series(ticks.error_nm.histogram("", BINS).color(0));
+    let (Some(bound), Some((low, high))) = (bound, ticks.error_nm.ends()) else {
+        return panel;
+    };
+    caption.push_str(", and would at the lowest possible (dashed)");
+    let sigma_nm = 1e3 * bound.rms_um;
+    let each = ticks.error_nm.count() as f64 * (high - low) / BINS as f64;
+    let most = 4.0 * sigma_nm;
+    let (x, y): (Vec<f64>, Vec<f64>) = (-100..=100)
+        .map(|k| {
+            let nm = most * f64::from(k) / 100.0;
+            let density =
+                (-0.5 * (nm / sigma_nm).powi(2)).exp() / (sigma_nm * std::f64::consts::TAU.sqrt());
+            (nm, each * density)
+        })
+        .unzip();
+    panel.series(Series::line("", &x, &y).dashed().color(1))
+}
+
+/// Amplitude reached of each that was commanded.
+fn amplitudes(reached: &[(f64, Vec<f64>)]) -> Panel {
+    let names: Vec<String> = reached
+        .iter()
+        .map(|(um, _)| super::cycles::short(*um))
+        .collect();
+    let at: Vec<f64> = (0..reached.len()).map(|n| n as f64).collect();
+    let of = |end: f64| -> Vec<f64> {
+        let value = |values: &Vec<f64>| 100.0 * (mean(values) + end * super::half95(values));
+        reached.iter().map(|(_, values)| value(values)).collect()
+    };
+    let means: Vec<f64> = reached
+        .iter()
+        .map(|(_, values)| 100.0 * mean(values))
+        .collect();
+    let axis = Axis::categories("commanded amplitude (um)", &names);
+    Panel::new(axis, Axis::linear("reached", "%"))
+        .series(Series::intervals("reached", &at, &means, &of(-1.0), &of(1.0)).color(0))
+        .horizontal(100.0, "")
 }
 
 #[cfg(test)]
@@ -307,12 +477,15 @@ mod tests {
                 row
             })
             .collect();
-        let text = of_a_cell(&rows).unwrap();
+        let text = of_a_cell(&rows).unwrap().result;
         assert!(
             text.contains("3.7") && text.contains("3.4") && text.contains("40 cycles"),
             "{text}"
         );
-        assert!(text.contains("recovery time from 0.19"), "{text}");
+        assert!(
+            text.contains("time constant of its recovery from 0.19"),
+            "{text}"
+        );
         assert!(of_a_cell(&[]).is_none());
     }
 }

@@ -47,6 +47,16 @@ impl Spread {
         narrow.map_or(self.kept.len() as u64, |narrow| narrow.counts.iter().sum())
     }
 
+    /// Smallest and largest value.
+    pub(super) fn ends(&self) -> Option<(f64, f64)> {
+        if let Some(narrow) = &self.narrow {
+            return Some((narrow.low, narrow.high));
+        }
+        let least = self.kept.iter().copied().reduce(f64::min)?;
+        let most = self.kept.iter().copied().reduce(f64::max)?;
+        Some((least, most))
+    }
+
     /// Counts in equal bins between the smallest and the largest value.
     pub(super) fn histogram(&self, label: &str, bins: usize) -> Series {
         let Some(narrow) = &self.narrow else {

@@ -1,5 +1,6 @@
 //! Figures of a report, gathered in one pass over the ticks.
 
+use super::course::RmsCourse;
 use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::{Decades, Spread};
@@ -54,6 +55,8 @@ pub(super) struct Ticks {
     pub error_nm: Spread,
     /// The same over the run, nm; NaN if it does not count.
     pub error: Envelope<1>,
+    /// Its RMS over the run from the first closing of the loop on, nm.
+    pub rms_nm: RmsCourse,
     /// Whether the target moved while the error counted.
     pub target_moves: bool,
     counted_target_um: Option<f64>,
@@ -145,6 +148,7 @@ impl Ticks {
         if !r.is_running() {
             return;
         }
+        self.rms_nm.add(time_s, r.error_um * 1e3);
         let since_s = time_s - *self.first_running_s.get_or_insert(time_s);
         if since_s <= 2.0 {
             self.excerpt.time_s.push(time_s);
@@ -235,6 +239,11 @@ impl Ticks {
         self.end_s + self.period_s()
     }
 
+    /// How long the errors are of, s.
+    pub(super) fn counted_s(&self) -> f64 {
+        self.error_nm.count() as f64 * self.period_s()
+    }
+
     /// Mean period of the ticks, s.
     pub(super) fn period_s(&self) -> f64 {
         if self.period_s.1 > 0 {
@@ -263,8 +272,7 @@ impl Ticks {
             return None;
         };
         let squares: f64 = spectrum.nm_per_rthz.iter().map(|nm| nm.powi(4)).sum();
-        let counted_s = self.error_nm.count() as f64 * self.period_s();
-        let variance_sd = (squares * (second - first) / counted_s).sqrt();
+        let variance_sd = (squares * (second - first) / self.counted_s()).sqrt();
         let rms_nm = self.rms_um()? * 1e3;
         Some(1.96 * variance_sd / (2.0 * rms_nm) * 1e-3)
     }

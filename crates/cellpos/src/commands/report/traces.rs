@@ -27,16 +27,48 @@ fn partner(ticks: &Ticks) -> Panel {
 
 /// Position and target over the whole run.
 pub(super) fn position(ticks: &Ticks) -> Panel {
-    // The target is thin and on top; one that moves fast has an upper and a lower end.
-    let target = ticks.traces.course_of(0, ticks.period_rows());
-    let panel = Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"));
-    let panel = enveloped(panel, ticks, 1, "measured", 0);
+    // The target is thin and on top; of one that moves fast both are drawn by their upper and lower ends, which keep the peaks.
+    let period_rows = ticks.period_rows();
+    let target = ticks.traces.course_of(0, period_rows);
+    let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"));
+    let ends = ticks.motion_rms_um().is_some() && !ticks.traces.is_bare();
+    if ends {
+        let course = ticks.traces.course_of(1, period_rows);
+        let of = |name: &str, um: &[f64]| Series::line(name, &course.time_s, um).color(0);
+        panel = panel
+            .series(Series::band("", &course.time_s, &course.low, &course.high).color(0))
+            .series(of("measured", &course.low))
+            .series(of("", &course.high));
+    } else {
+        panel = enveloped(panel, ticks, 1, "measured", 0);
+    }
     let end = |name: &str, um: &[f64]| Series::line(name, &target.time_s, um).thin().color(1);
     let panel = panel.series(end("target", &target.low));
     match ticks.traces.is_bare() {
         true => panel,
         false => panel.series(end("", &target.high)),
     }
+}
+
+/// The error over the run, tick by tick or as an envelope with its median.
+pub(super) fn error(ticks: &Ticks) -> Figure {
+    let course = ticks.error.course(0);
+    let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear("error", "nm"));
+    let mut caption = "Error from two seconds after the loop was closed.".to_string();
+    if !ticks.error.is_bare() {
+        let band = Series::band(
+            "smallest to largest",
+            &course.time_s,
+            &course.low,
+            &course.high,
+        );
+        panel = panel.series(band.color(0));
+        caption.push_str(
+            " Area: from the smallest to the largest of each stretch of time; line: median.",
+        );
+    }
+    let median = Series::line("median", &course.time_s, &course.median);
+    Figure::new("error-over-time", &caption).panel(panel.series(median.color(0).thin()))
 }
 
 /// Position and target, PZT and zero flow over the whole run.
@@ -77,6 +109,9 @@ pub(super) fn traces(page: &mut Report, ticks: &Ticks, whole: bool) {
     let time = || Axis::linear("time", "s");
     if whole {
         page.figure(over_the_run(ticks));
+    }
+    if ticks.rms_um().is_some() {
+        page.figure(error(ticks));
     }
     let near = &ticks.excerpt;
     if near.time_s.is_empty() {

@@ -2,46 +2,67 @@
 
 use super::data::{ARMS, Compared, Quantity, values};
 use crate::commands::report::cycles::with_interval;
-use crate::commands::report::fatigue::tens;
+use crate::commands::report::fatigue::{OF_FIRST_LENGTH, tens};
 use cellpos_report::{Axis, Column, Figure, Panel, Series, Table};
 use cellpos_script::ArmKind;
 
-/// A curve for each run and arm: means of ten cycles with their 95 % intervals.
+/// Means of ten cycles of each run, side by side so that each is seen.
 pub(super) fn over_cycles(compared: &[Compared], quantities: &[Quantity]) -> Figure {
     let mut figure = Figure::new(
         "comparison",
-        "Each run over its cycles: means of ten cycles (lines) with the 95 % interval of each mean (areas); every cycle of a run \
-         with fewer than twenty. Dashed: the static arm. Cycles in which bead or cell was elsewhere than the script had it are left out.",
-    );
-    for quantity in quantities {
-        let y = Axis::linear(quantity.name, quantity.unit);
-        let mut panel = Panel::new(Axis::linear("cycle", ""), y).height_px(150.0);
-        for (color, run) in compared.iter().enumerate() {
-            for arm in ARMS {
-                let points = values(&run.rows, arm, quantity);
-                if points.is_empty() {
-                    continue;
-                }
-                let name = match arm {
-                    ArmKind::Cyclic => run.name.clone(),
-                    ArmKind::Static => format!("{}, static", run.name),
-                };
-                let [mut cycle, mut mean, low, high] = tens(&points);
-                if cycle.len() < 2 {
-                    (cycle, mean) = points.iter().copied().unzip();
-                } else {
-                    panel = panel.series(Series::band("", &cycle, &low, &high).color(color));
-                }
-                let line = Series::line(&name, &cycle, &mean).color(color);
-                panel = panel.series(match arm {
-                    ArmKind::Cyclic => line,
-                    ArmKind::Static => line.dashed(),
-                });
+        &format!(
+            "Each run over its cycles: means of ten cycles with the 95 % interval from the scatter within that run, where it is larger \
+             than the point; every cycle of a run with fewer than twenty. The runs' points of the same cycles are drawn side by side. \
+             Cycles in which bead or cell was elsewhere than the script had it are left out. {OF_FIRST_LENGTH}"
+        ),
+    )
+    .columns(2);
+    for (number, quantity) in quantities.iter().enumerate() {
+        for arm in ARMS {
+            // What is under a static load is told by its first quantity.
+            let panel = panel(compared, arm, quantity);
+            if let Some(panel) = panel.filter(|_| arm == ArmKind::Cyclic || number == 0) {
+                figure = figure.panel(panel);
             }
         }
-        figure = figure.panel(panel);
     }
-    figure.share_x()
+    figure
+}
+
+/// A quantity of one arm of all runs; none if no run has it.
+fn panel(compared: &[Compared], arm: ArmKind, quantity: &Quantity) -> Option<Panel> {
+    /// Share of the ten cycles over which the runs' points are spread.
+    const SPREAD: f64 = 0.6;
+    let title = match arm {
+        ArmKind::Cyclic => "over the cycles",
+        ArmKind::Static => "at rest under static load (in cycles' time)",
+    };
+    let mut panel = Panel::new(
+        Axis::linear("cycle", ""),
+        Axis::linear(quantity.name, quantity.unit),
+    )
+    .title(title)
+    .height_px(170.0);
+    let mut any = false;
+    for (color, run) in compared.iter().enumerate() {
+        let points = values(&run.rows, arm, quantity);
+        any |= !points.is_empty();
+        let [cycle, mean, low, high] = tens(&points);
+        let place = (color as f64 + 0.5) / compared.len() as f64 - 0.5;
+        panel = panel.series(match cycle.len() < 2 {
+            true => {
+                let (cycle, value): (Vec<f64>, Vec<f64>) = points.into_iter().unzip();
+                Series::points(&run.name, &cycle, &value)
+                    .color(color)
+                    .thin()
+            }
+            false => {
+                let at: Vec<f64> = cycle.iter().map(|c| c + 10.0 * SPREAD * place).collect();
+                Series::intervals(&run.name, &at, &mean, &low, &high).color(color)
+            }
+        });
+    }
+    any.then_some(panel)
 }
 
 /// The error of each run, with its interval and the bound.

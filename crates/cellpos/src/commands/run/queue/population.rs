@@ -1,10 +1,10 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
-use crate::commands::report::{half95, was_elsewhere, with_interval};
+use crate::commands::report::{OF_FIRST_LENGTH, half95, was_elsewhere, with_interval};
 use crate::commands::run::over::Over;
 use crate::output::command_line;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, student95, trend};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -151,16 +151,27 @@ pub(super) fn text(rows: &[CellRow]) -> String {
     rows.iter().map(line).collect()
 }
 
-/// Mean over the cells at each cycle that two cells or more have: cycle, mean, low, high.
+/// Mean over the cells at each cycle that two cells or more have, with its 95 % interval: cycle, mean, low, high. Few cells tell
+/// their spread badly at one cycle alone: it is taken from all cycles together.
 fn mean_course(courses: &[Vec<(f64, f64)>]) -> [Vec<f64>; 4] {
     let mut at: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
     for (cycle, value) in courses.iter().flatten() {
         at.entry(*cycle as u64).or_default().push(*value);
     }
+    at.retain(|_, values| values.len() > 1);
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let (squares, freedom) = at.values().fold((0.0, 0), |(squares, freedom), values| {
+        let of = mean(values);
+        let sum: f64 = values.iter().map(|value| (value - of).powi(2)).sum();
+        (squares + sum, freedom + values.len() - 1)
+    });
+    let sd = (squares / freedom.max(1) as f64).sqrt();
     let mut columns: [Vec<f64>; 4] = Default::default();
-    for (cycle, values) in at.iter().filter(|(_, values)| values.len() > 1) {
-        let mean = values.iter().sum::<f64>() / values.len() as f64;
-        let half = half95(values);
+    for (cycle, values) in &at {
+        let n = values.len();
+        // A cell differs from the others in each of its cycles alike: more cycles are no more cells.
+        let half = student95(n - 1) * sd / (n as f64).sqrt();
+        let mean = mean(values);
         for (column, value) in
             columns
                 .iter_mut()
@@ -185,7 +196,9 @@ pub(super) fn sentence(done: usize, rows: &[CellRow], cycles: &[Vec<CycleRow>]) 
             "",
             |row, rest| rest.stretch(row),
         ),
-        ("recovery time", " s", |row, _| row.recovery_s),
+        ("time constant of its recovery", " s", |row, _| {
+            row.recovery_s
+        }),
     ];
     let mut parts = Vec::new();
     for (name, unit, value) in quantities {
@@ -197,20 +210,27 @@ pub(super) fn sentence(done: usize, rows: &[CellRow], cycles: &[Vec<CycleRow>]) 
             .collect();
         let mean = |of: fn(&Trend) -> f64| {
             let values: Vec<f64> = trends.iter().map(of).collect();
-            let mean = values.iter().sum::<f64>() / values.len() as f64;
-            with_interval(mean, half95(&values))
+            (
+                values.iter().sum::<f64>() / values.len() as f64,
+                half95(&values),
+            )
         };
         if trends.len() > 1 {
-            parts.push(format!(
-                "{name} from {} to {}{unit}",
+            let (first, last) = (
                 mean(|trend| trend.first.mean),
-                mean(|trend| trend.last.mean)
+                mean(|trend| trend.last.mean),
+            );
+            let (change, _) = mean(|trend| 100.0 * (trend.last.mean / trend.first.mean - 1.0));
+            parts.push(format!(
+                "{name} from {} to {}{unit} ({change:+.1} %)",
+                with_interval(first.0, first.1),
+                with_interval(last.0, last.1)
             ));
         }
     }
     if !parts.is_empty() {
         text.push_str(&format!(
-            " {} (mean of the cells, first and last ten cycles of each, 95 % interval between cells).",
+            " {} (mean of the cells, first and last ten cycles of each).",
             parts.join(", ")
         ));
     }
@@ -244,6 +264,18 @@ fn lead(rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> String {
     )
 }
 
+/// What the intervals are of.
+fn sure(cells: usize) -> String {
+    match cells {
+        0 | 1 => "one cell does not tell how cells differ.".to_owned(),
+        n => format!(
+            "\u{b1} is the 95 % interval of the mean, from how the {n} cells differ (Student's t with {} degrees of freedom). It holds for \
+             cells drawn as these were.",
+            n - 1
+        ),
+    }
+}
+
 /// The page: the figure of the population, and the table.
 pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Report {
     let mut page = Report::new(&format!("Cells: {name}"));
@@ -255,17 +287,21 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     };
     page.lead(&lead(rows, cycles));
     page.result(status, &sentence(done, rows, cycles));
+    page.certainty(&sure(rows.len()));
     type Value = fn(&CycleRow, &AtRest) -> f64;
     let quantities: [(&str, &str, Value); 3] = [
         ("stretch", "", |row, rest| rest.stretch(row)),
-        ("length at start", "um", |row, _| row.length_start_um),
         ("recovery time", "s", |row, _| row.recovery_s),
+        ("length at start", "um", |row, _| row.length_start_um),
     ];
     let mut figure = Figure::new(
         "population",
-        "Thin: each cell. Thick: mean over the cells, with the 95 % interval of that mean as a band, at each cycle that two cells \
-         or more have. Whole, undisturbed cycles of the cyclic arm.",
-    );
+        &format!(
+            "Thin: each cell. Thick: mean over the cells with its 95 % interval (area), at each cycle that two cells or more have; how far \
+             cells differ is taken from all cycles together. Whole, undisturbed cycles. {OF_FIRST_LENGTH}"
+        ),
+    )
+    .columns(2);
     let mut any = false;
     for (name, unit, value) in quantities {
         let courses: Vec<Vec<(f64, f64)>> = (cycles.iter())
@@ -280,7 +316,7 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
         }
         any = true;
         let mut panel =
-            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(150.0);
+            Panel::new(Axis::linear("cycle", ""), Axis::linear(name, unit)).height_px(180.0);
         for (n, course) in (courses.iter().filter(|course| !course.is_empty())).enumerate() {
             let (x, y): (Vec<f64>, Vec<f64>) = course.iter().copied().unzip();
             let name = if n == 0 { "each cell" } else { "" };
@@ -289,13 +325,13 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
         let [cycle, mean, low, high] = mean_course(&courses);
         if !cycle.is_empty() {
             panel = panel
-                .series(Series::band("", &cycle, &low, &high).color(0))
+                .series(Series::band("95 % of the mean", &cycle, &low, &high).color(0))
                 .series(Series::line("mean of the cells", &cycle, &mean).color(0));
         }
         figure = figure.panel(panel);
     }
     if any {
-        page.figure(figure.share_x());
+        page.figure(figure);
     } else {
         page.paragraph(
             "No length was measured in these runs: the table below is of the tracking alone.",
@@ -351,11 +387,14 @@ mod tests {
         let [cycle, mean, low, high] = mean_course(&courses);
         assert_eq!(cycle, [1.0, 2.0]);
         assert!((mean[0] - 3.2).abs() < 1e-12 && (mean[1] - 2.9).abs() < 1e-12);
-        // Two values d apart: a standard error of d / 2, times t of one degree of freedom.
-        assert!(
-            (high[0] - mean[0] - 12.706 * 0.2).abs() < 1e-9
-                && (mean[0] - low[0] - 12.706 * 0.2).abs() < 1e-9
-        );
+        // Values 0.4 and 0.2 apart: a variance of (0.08 + 0.02) / 2, the mean's is half of it, times t of one degree of freedom. It is
+        // the same where two cells happen to meet.
+        let half = 12.706 * 0.025_f64.sqrt();
+        for k in [0, 1] {
+            assert!(
+                (high[k] - mean[k] - half).abs() < 1e-9 && (mean[k] - low[k] - half).abs() < 1e-9
+            );
+        }
         assert!(half95(&[1.0]).is_nan());
     }
 }
