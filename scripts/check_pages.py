@@ -5,7 +5,7 @@
     scripts/check_pages.py PICTURES target/debug/cellpos    # of pages that it makes: a page of each kind
     scripts/check_pages.py - target/debug/cellpos           # the same without pictures: much faster
 
-Says which page does not show on the first screen what was done and what came out, which figure has no caption or cannot be taken along, what of a figure's text is cut off, lies upon another text or cannot be read against its ground, which name stands twice in one
+Says which page does not show on the first screen what was done, what came out and how sure it is, which figure has no caption or cannot be taken along, what of a figure's text is cut off, lies upon another text or cannot be read against its ground, which name stands twice in one
 legend, and what makes a page wider than its window; writes a picture of each into the folder PICTURES, to be looked at. Needs
 Chromium. Exit code 1: something was found.
 """
@@ -35,6 +35,8 @@ addEventListener("load", () => {
   // A reader of the first screen knows what was done and what came out: a sentence, and the beginning of a figure.
   const seen = [...document.querySelectorAll("p.result")].filter(e => e.getBoundingClientRect().bottom <= 850);
   if (!seen.length) found.push("the first screen has no result");
+  const sure = [...document.querySelectorAll("p.sure")].filter(e => e.getBoundingClientRect().bottom <= 850);
+  if (innerWidth > 1000 && !sure.length) found.push("the first screen does not say how sure the result is");
   const done = [...document.querySelectorAll("p.lead")].filter(e => e.getBoundingClientRect().bottom <= 400 && e.textContent.length > 10);
   if (!done.length) found.push("the first screen does not say what was done");
   const first = [...document.querySelectorAll("figure")].find(e => e.getBoundingClientRect().width)?.getBoundingClientRect();

@@ -306,15 +306,18 @@ fn figure(check: &Check) -> Figure {
     )
     .panel(
         Panel::new(time(), Axis::linear("position of the bead", "um"))
+            .height_px(170.0)
             .series(Series::line("", &check.time_s, &check.reference_um)),
     )
     .panel(
         Panel::new(Axis::categories("", &names), Axis::linear("used", "%"))
+            .height_px(170.0)
             .series(Series::bars("", &at, &used, 0.6).color(1))
             .horizontal(100.0, "limit"),
     )
     .panel(
         Panel::new(time(), Axis::linear("PZT", "um"))
+            .height_px(170.0)
             .series(Series::step("", &check.time_s, &check.demand_um).color(2)),
     )
     .columns(2)

@@ -28,7 +28,7 @@ use cellpos_runtime::Summary;
 use cellpos_runtime::summary::plan_warning;
 use cellpos_script::CycleRow;
 pub(crate) use cycles::{half95, was_elsewhere, with_interval};
-pub(crate) use fatigue::OF_FIRST_LENGTH;
+pub(crate) use fatigue::{OF_LENGTH, length_between};
 use origin::what_it_was;
 use recorded::Recorded;
 use session::{Session, ending, events, provenance, timing};
@@ -54,6 +54,13 @@ pub(crate) struct Args {
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
+}
+
+/// On what a run was made; nothing if its folder does not say.
+pub(crate) fn rig_of(run: &Path) -> &'static str {
+    let reader = RunReader::open(run).ok();
+    let meta = reader.as_ref().and_then(|reader| reader.meta().ok());
+    meta.map_or("", origin::rig)
 }
 
 /// Writes the page.

@@ -48,7 +48,7 @@ pub(super) fn answer(r: &mut Report, result: &Reconciliation) {
     let names: Vec<String> = result.effects.iter().map(clause).collect();
     let names = names.join("; ");
     let (status, text) = match result.verdict {
-        Verdict::Named => (Emphasis::Good, format!("The model lacks {names}.")),
+        Verdict::Named => (Emphasis::Good, format!("The model lacks: {names}.")),
         Verdict::NamedWithRemainder => (
             Emphasis::Warning,
             format!("The model lacks {names}; and something more that the catalogue does not name."),
@@ -78,20 +78,20 @@ pub(super) fn answer(r: &mut Report, result: &Reconciliation) {
     let text_of_gap = match result.verdict {
         Verdict::NothingMissing => {
             format!(
-                "The prediction error on held-out records is {before}; the noise floor is {floor}."
+                "The prediction error on records that the fit had not seen is {before}; the noise floor is {floor}."
             )
         }
         Verdict::Unknown => format!(
-            "The prediction error on held-out records is {before}, and {after} with the best of the catalogue; the noise floor is {floor}."
+            "The prediction error on records that the fit had not seen is {before}, and {after} with the best of the catalogue; the noise floor is {floor}."
         ),
         // Frames that are missing or repeated make no error of prediction.
         _ if g.after >= g.before => {
             format!(
-                "The prediction error on held-out records stays {after}; the noise floor is {floor}."
+                "The prediction error on records that the fit had not seen stays {after}; the noise floor is {floor}."
             )
         }
         _ => format!(
-            "With that the prediction error on held-out records falls from {before} to {after}; the noise floor is {floor}."
+            "With that the prediction error on records that the fit had not seen falls from {before} to {after}; the noise floor is {floor}."
         ),
     };
     r.result(status, &format!("{text} {text_of_gap}"));
@@ -107,7 +107,7 @@ fn sure(result: &Reconciliation) -> String {
             Some(less) => format!("below {less}"),
             None => p,
         };
-        format!("The probability that chance made what was found, in the whole search, is {p}. Intervals are those of the fit. ")
+        format!("the probability that chance made what was found, in the whole search, is {p}. Intervals are those of the fit. ")
     });
     let floor = match result.floor.is_known() {
         true => "The noise floor is known from the records or the model",

@@ -374,7 +374,7 @@ fn innovations(r: &mut Report, result: &Reconciliation) {
             &format!(
                 "Where the prediction error is: its part in each frequency band, of the model as it was and with the effects added, and the part \
                  that noise alone has (points; by chance a band is a little below it). The squares of the parts add up to the square of the \
-                 whole: {} before, {} after, {} of noise, of all records together.",
+                 whole: {} before, {} after, {} of noise, of all records together, each counting alike.",
                 whole(|b| b.before),
                 whole(|b| b.after),
                 whole(|b| b.floor)

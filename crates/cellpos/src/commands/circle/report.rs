@@ -240,7 +240,7 @@ fn worth(first: &Stage, last: &Stage, name: &str, of: OfStage) -> (String, i8) {
         _ => 0,
     };
     (
-        format!("{} before, {} after {name}", said(first), said(last)),
+        format!("{name} {} before, {} after", said(first), said(last)),
         sign,
     )
 }
@@ -267,7 +267,7 @@ fn sentence(circle: &Circle) -> (Emphasis, String) {
             }
             _ => "The controller of the corrected model gains nothing",
         };
-        text.push_str(&format!(" {verdict}: RMS error {}.", runs.join(", ")));
+        text.push_str(&format!(" {verdict}: RMS error {}.", runs.join("; ")));
     }
     let status = match circle.reconciled.verdict {
         Verdict::Unknown => Emphasis::Bad,

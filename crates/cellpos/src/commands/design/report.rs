@@ -27,13 +27,31 @@ pub(super) fn page(
         ControllerConfig::Lqg(_) => "LQG",
         ControllerConfig::Mpc(..) => "MPC",
     };
+    let of_model = match model {
+        "eq6" => "the built-in model eq6 of a bead that follows the piezo".to_owned(),
+        other => format!("the model {other} of how a bead follows the piezo"),
+    };
+    let gains = match &report.controller {
+        ControllerConfig::Pi(pi) => {
+            format!(", kp = {:.3}, ki = {:.1} /s", pi.kp, pi.ki_per_s)
+        }
+        _ => String::new(),
+    };
     page.lead(&format!(
-        "Task: design a controller ({law}) that holds a bead on the plant {model}, with {:.2} ms from the exposure of a frame to the middle \
-         of the command that follows from it. All figures are calculated from the model; nothing was measured.",
+        "Task: design a controller ({law}{gains}) that holds a bead, for {of_model}: a frame each {} ms, and {:.2} ms from its exposure to the \
+         middle of the command that follows from it. All figures are calculated from the model; nothing was measured.",
+        request.plant.sample_time_s * 1e3,
         request.plant.loop_delay_s() * 1e3
     ));
     let (status, sentence) = sentence(request, report);
     page.result(status, &sentence);
+    page.certainty(&format!(
+        "calculated, so as sure as the model, whose own error is not in these figures; the margins say how wrong it may be before the loop is \
+         unstable: by {:.1} dB in gain or {:.2} ms in delay, one at a time. Lowest possible: what Brownian motion does to the bead within the \
+         delay, under any controller.",
+        report.margins.gm_db,
+        report.margins.delay_margin_s * 1e3
+    ));
     let Some(law) = report.law(&request.plant) else {
         page.command(&command_line());
         return Ok(page);
@@ -46,7 +64,14 @@ pub(super) fn page(
     let sensitivity: Vec<f64> = (response.iter())
         .map(|[re, im]| 1.0 / (re + 1.0).hypot(*im))
         .collect();
-    page.figure(nyquist(&response, report));
+    let density = predicted_density_um(&request.plant, &law, &hz)?;
+    let density: Vec<f64> = density.iter().map(|um| um * 1e3).collect();
+    page.figure(first(
+        &hz,
+        &of_the_bead(request, &density, &response),
+        &response,
+        report,
+    ));
     page.section("Margins");
     page.table(margins(report));
     page.figure(bode(&hz, &response, report));
@@ -64,8 +89,6 @@ pub(super) fn page(
     );
     step(&mut page, request, report);
     page.section("Error to be expected while holding");
-    let density = predicted_density_um(&request.plant, &law, &hz)?;
-    let density: Vec<f64> = density.iter().map(|um| um * 1e3).collect();
     page.figure(
         Figure::new(
             "predicted-spectrum",
@@ -106,10 +129,14 @@ fn sentence(request: &DesignRequest, report: &DesignReport) -> (Emphasis, String
         .filter(|row| !row.margins.stable)
         .count();
     let spread = match unstable {
-        0 => " It stays stable for gains from half to twice the model's and for one more sample of delay.".to_string(),
+        0 => format!(
+            " It stays stable for gains from half to twice the model's and for {} ms more delay.",
+            request.plant.sample_time_s * 1e3
+        ),
         some => format!(
-            " It is unstable in {some} of {} cases of another gain (half to twice) or one more sample of delay.",
-            report.spread.len()
+            " It is unstable in {some} of {} cases of another gain (half to twice) or {} ms more delay.",
+            report.spread.len(),
+            request.plant.sample_time_s * 1e3
         ),
     };
     let broken: Vec<String> = (report.limits_broken.iter())
@@ -134,26 +161,113 @@ fn sentence(request: &DesignRequest, report: &DesignReport) -> (Emphasis, String
     (status, text)
 }
 
-fn nyquist(response: &[[f64; 2]], report: &DesignReport) -> Figure {
-    // The integrator goes to infinity at low frequencies; what decides is near -1.
-    let near = response.iter().filter(|[re, im]| re.hypot(*im) < 4.0);
-    let (re, im): (Vec<f64>, Vec<f64>) = near.map(|[re, im]| (*re, *im)).unzip();
-    let closest = 1.0 / report.margins.ms;
+/// The error to be expected, summed up over frequency, and the Nyquist curve with its margins.
+fn first(hz: &[f64], density_nm: &[f64], response: &[[f64; 2]], report: &DesignReport) -> Figure {
+    let caption = format!(
+        "Left: RMS error while holding, of all frequencies up to each; at the right end it is the whole. Right: Nyquist curve of the loop gain, \
+         from low frequencies (below, out of the frame) to high ones (at 0). The loop is stable as the curve passes the point -1 on its right. \
+         Phase margin: angle from -1 to where the curve enters the unit circle; gain margin: what the gain may grow by until the crossing of the \
+         axis reaches -1. Its least distance from -1 is {:.2} (a sensitivity of at most {:.2}).",
+        1.0 / report.margins.ms,
+        report.margins.ms
+    );
+    let mut figure = Figure::new("nyquist", &caption).columns(2);
+    if let Some(noise) = &report.noise {
+        let (at, rms) = summed(hz, density_nm, noise.rms_um * 1e3);
+        let bound = 1e3 * report.bound_rms_um;
+        let (Some(first), Some(last)) = (at.first(), at.last()) else {
+            return figure.panel(nyquist(response, report));
+        };
+        figure = figure.panel(
+            Panel::new(
+                Axis::log("up to this frequency", "Hz"),
+                Axis::linear("error", "nm RMS"),
+            )
+            .height_px(300.0)
+            .series(
+                Series::line(
+                    &format!("predicted, in all {:.0} nm", noise.rms_um * 1e3),
+                    &at,
+                    &rms,
+                )
+                .color(0),
+            )
+            .series(
+                Series::line(
+                    &format!("lowest possible, in all {bound:.0} nm"),
+                    &[*first, *last],
+                    &[bound; 2],
+                )
+                .dashed()
+                .color(1),
+            ),
+        );
+    }
+    figure.panel(nyquist(response, report))
+}
+
+/// The density of the bead's own error: that of the measured one without the noise of the fixes, with what the controller makes of it.
+fn of_the_bead(request: &DesignRequest, measured_nm: &[f64], response: &[[f64; 2]]) -> Vec<f64> {
+    let plant = &request.plant;
+    let white = 2.0 * plant.sample_time_s * (1e3 * plant.fix_noise_um).powi(2);
+    (measured_nm.iter().zip(response))
+        .map(|(nm, [re, im])| {
+            let closed = (re + 1.0).hypot(*im).powi(2);
+            // |S|^2 of the noise is in the measured position, |T|^2 of it in the bead's.
+            (nm * nm - white * (1.0 - re * re - im * im) / closed)
+                .max(0.0)
+                .sqrt()
+        })
+        .collect()
+}
+
+/// RMS of a density up to each frequency. The curve begins with what is below its first frequency, so that it ends at the whole.
+fn summed(hz: &[f64], density_nm: &[f64], whole_nm: f64) -> (Vec<f64>, Vec<f64>) {
+    let mut sums = vec![0.0];
+    for (f, d) in hz.windows(2).zip(density_nm.windows(2)) {
+        let step = 0.5 * (d[0] * d[0] + d[1] * d[1]) * (f[1] - f[0]);
+        sums.push(sums.last().copied().unwrap_or(0.0) + step);
+    }
+    let below = (whole_nm * whole_nm - sums.last().copied().unwrap_or(0.0)).max(0.0);
+    let rms = sums.iter().map(|sum| (sum + below).sqrt()).collect();
+    (hz.to_vec(), rms)
+}
+
+fn nyquist(response: &[[f64; 2]], report: &DesignReport) -> Panel {
+    let m = &report.margins;
+    let (re, im): (Vec<f64>, Vec<f64>) = response.iter().map(|[re, im]| (*re, *im)).unzip();
     let circle: Vec<f64> = (0..=90)
         .map(|n| f64::from(n) * std::f64::consts::TAU / 90.0)
         .collect();
-    let circle_x: Vec<f64> = circle.iter().map(|a| -1.0 + closest * a.cos()).collect();
-    let circle_y: Vec<f64> = circle.iter().map(|a| closest * a.sin()).collect();
-    Figure::nyquist(
-        "nyquist",
-        &format!(
-            "Nyquist curve of the loop gain. It passes the point -1 at a distance of {closest:.2} (dashed circle, 1/Ms with Ms = {:.2}); \
-             a curve that went round it would be an unstable loop.",
-            report.margins.ms
-        ),
+    let cos: Vec<f64> = circle.iter().map(|a| a.cos()).collect();
+    let sin: Vec<f64> = circle.iter().map(|a| a.sin()).collect();
+    let crossover = (m.pm_deg - 180.0).to_radians();
+    let crossing = -(10f64.powf(-m.gm_db / 20.0));
+    Panel::new(
+        Axis::linear("real part", "").range(-2.0, 1.2),
+        Axis::linear("imaginary part", "").range(-2.0, 1.2),
     )
+    .equal_axes()
+    .height_px(300.0)
+    .series(Series::line("unit circle", &cos, &sin).thin().color(7))
     .series(Series::line("loop gain", &re, &im).color(0))
-    .series(Series::line("1/Ms", &circle_x, &circle_y).dashed().color(1))
+    .series(Series::points("\u{2212}1", &[-1.0], &[0.0]).color(7))
+    .series(
+        Series::points(
+            &format!("phase margin {:.0} deg", m.pm_deg),
+            &[crossover.cos()],
+            &[crossover.sin()],
+        )
+        .color(1),
+    )
+    .series(
+        Series::points(
+            &format!("gain margin {:.1} dB", m.gm_db),
+            &[crossing],
+            &[0.0],
+        )
+        .color(2),
+    )
 }
 
 fn bode(hz: &[f64], response: &[[f64; 2]], report: &DesignReport) -> Figure {

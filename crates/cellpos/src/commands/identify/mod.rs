@@ -1,5 +1,6 @@
 //! `cellpos identify`: excite, measure the frequency response, fit, write model.toml and a report.
 
+mod bode;
 mod foreign;
 pub(crate) mod json;
 pub(crate) mod report;
@@ -383,7 +384,10 @@ pub(crate) fn run(args: Args) -> CommandResult {
     );
     let rig = match &args.rig {
         Some(path) => path.display().to_string(),
-        None => format!("emulated, model {}, seed {}", args.model, job.seed),
+        None => format!(
+            "emulated (a simulation of the model {}, seed {})",
+            args.model, job.seed
+        ),
     };
     let provenance = BTreeMap::from([
         ("command".to_owned(), command_line()),

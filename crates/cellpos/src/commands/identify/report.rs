@@ -1,138 +1,13 @@
 //! The report of an identification: Bode with bands, Nyquist, residuals, traces, delay test, parameters.
 
+pub(crate) use super::bode::{Shown, bode, log_grid};
 use super::tables::interval;
 pub(crate) use super::tables::{candidates, lines, number, parameters};
 use cellpos_experiment::identify::Done;
-use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::frequency_response::FrequencyPoint;
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
-use cellpos_plant::{EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
 use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
-
-/// Frequencies for curves, Hz: `count` evenly in the logarithm.
-pub(crate) fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
-    (0..count)
-        .map(|i| low_hz * (high_hz / low_hz).powf(i as f64 / (count - 1) as f64))
-        .collect()
-}
-
-fn unwrapped_deg(phase: f64) -> f64 {
-    phase - 360.0 * ((phase + 90.0) / 360.0).round()
-}
-
-/// A band wider than the intervals of its points by this factor shows a parameter that the points do not determine: a plant of
-/// `p` parameters through `n` points has a band of about sqrt(p/n) intervals, so one interval or less.
-const WIDEST_BAND: f64 = 3.0;
-
-/// Ends of the fit's 95 % band (gain or phase) at each frequency, NaN beyond the measured ones; all NaN if the band describes the
-/// points nowhere near as well as they are known. Then there is no band: parts of one would look like a feature of the plant.
-fn band(result: &Identification, grid: &[f64], phase: bool) -> [Vec<f64>; 2] {
-    let points = &result.compensated;
-    let at = |hz: f64| {
-        let (gain, angle) = result.band(hz);
-        if phase { angle } else { gain }
-    };
-    let describes = points.iter().all(|p| {
-        let sd = if phase { p.phase_sd_deg } else { p.gain_sd_db };
-        let [low, high] = at(p.frequency_hz);
-        high - low <= WIDEST_BAND * 2.0 * 1.96 * sd
-    });
-    let of = |pick: fn(f64, f64) -> f64| points.iter().map(|p| p.frequency_hz).fold(f64::NAN, pick);
-    let measured = of(f64::min)..=of(f64::max);
-    let ends = grid
-        .iter()
-        .map(|hz| match describes && measured.contains(hz) {
-            true => at(*hz),
-            false => [f64::NAN; 2],
-        });
-    let (low, high) = ends.map(|[low, high]| (low, high)).unzip();
-    [low, high]
-}
-
-/// Bode plot of the compensated points, the fitted model with its 95 % band, and, if asked for, Eq. (6) and 2 pi 63/s.
-pub(crate) fn bode(
-    name: &str,
-    caption: &str,
-    result: &Identification,
-    (high_hz, eq6): (f64, bool),
-) -> Figure {
-    let points = &result.compensated;
-    let f: Vec<f64> = points.iter().map(|p| p.frequency_hz).collect();
-    let lowest = f.iter().copied().fold(f64::INFINITY, f64::min);
-    let grid = log_grid(0.7 * lowest, high_hz, 160);
-    let ([gain_from, gain_to], [phase_from, phase_to]) =
-        (band(result, &grid, false), band(result, &grid, true));
-    let gain: Vec<f64> = points.iter().map(|p| p.gain_db).collect();
-    let phase: Vec<f64> = points.iter().map(|p| p.phase_deg).collect();
-    let shifted = |sign: f64| -> (Vec<f64>, Vec<f64>) {
-        points
-            .iter()
-            .map(|p| {
-                (
-                    p.gain_db + sign * 1.96 * p.gain_sd_db,
-                    p.phase_deg + sign * 1.96 * p.phase_sd_deg,
-                )
-            })
-            .unzip()
-    };
-    let (gain_low, phase_low) = shifted(-1.0);
-    let (gain_high, phase_high) = shifted(1.0);
-    let model = result.judged.model;
-    let curve = |g: &dyn Fn(f64) -> cellpos_plant::Complex<f64>| -> (Vec<f64>, Vec<f64>) {
-        grid.iter()
-            .map(|&f| g(f))
-            .map(|c| (20.0 * c.norm().log10(), unwrapped_deg(c.arg().to_degrees())))
-            .unzip()
-    };
-    let (model_gain, model_phase) = curve(&|f| model.response(f));
-    // What is not drawn is not in the legend.
-    let name_of = |ends: &[f64]| match ends.iter().any(|end| end.is_finite()) {
-        true => "95 % of the fit",
-        false => "",
-    };
-    let delayed: Vec<f64> = points.iter().map(|p| p.delayed_phase_deg).collect();
-    let figure = Figure::bode(name, caption)
-        .bode_series(
-            Series::band(name_of(&gain_from), &grid, &gain_from, &gain_to),
-            Series::band(name_of(&phase_from), &grid, &phase_from, &phase_to),
-        )
-        .bode_series(
-            Series::line("fit", &grid, &model_gain),
-            Series::line("fit", &grid, &model_phase),
-        )
-        .bode_series(
-            Series::intervals("measured", &f, &gain, &gain_low, &gain_high),
-            Series::intervals(
-                // One legend for both panels: the same words in both.
-                "measured",
-                &f,
-                &phase,
-                &phase_low,
-                &phase_high,
-            ),
-        )
-        .bode_series(
-            Series::points("measured, delay left in", &[], &[]),
-            Series::points("measured, delay left in", &f, &delayed),
-        );
-    if !eq6 {
-        return figure;
-    }
-    let nominal = TransferFunction::eq6();
-    let (eq6_gain, eq6_phase) = curve(&|f| nominal.response(Hertz(f)));
-    let integrator = CandidateModel::integrator(EQ5_VELOCITY_GAIN_PER_S, 0.0);
-    let (eq5_gain, eq5_phase) = curve(&|f| integrator.response(f));
-    figure
-        .bode_series(
-            Series::line("Eq. (6)", &grid, &eq6_gain).dashed(),
-            Series::line("Eq. (6)", &grid, &eq6_phase).dashed(),
-        )
-        .bode_series(
-            Series::line("2\u{3c0} 63/s", &grid, &eq5_gain).thin(),
-            Series::line("2\u{3c0} 63/s", &grid, &eq5_phase).thin(),
-        )
-}
 
 /// Nyquist plot of the record and the fitted model with hold and delay.
 pub(crate) fn nyquist(result: &Identification) -> Figure {
@@ -345,12 +220,14 @@ fn sentence(done: &Done) -> (Emphasis, String) {
     if unknown > 0 && !known.is_empty() {
         let all = result.judged.parameters.len();
         text.push_str(&format!(
-            " These frequencies do not determine the other {unknown} of the {all} parameters."
+            " Of the model's {all} parameters these frequencies determine {}; {unknown} stay unknown.",
+            known.len()
         ));
     }
     let status = match (known.is_empty(), result.warnings.is_empty()) {
         (true, _) => Emphasis::Bad,
         (false, false) => Emphasis::Warning,
+        (false, true) if unknown > 0 => Emphasis::Plain,
         (false, true) => Emphasis::Good,
     };
     (status, text)
@@ -374,12 +251,16 @@ pub(crate) fn report(done: &Done, rig: &str, command_line: &str, eq6: bool) -> R
     ));
     let (status, sentence) = sentence(done);
     report.result(status, &sentence);
+    report.certainty(
+        "intervals are 95 %, of this one record, from the scatter of the measured response between its periods. They hold if the plant has \
+         the form of the fitted model; the residuals on the right of the figure show whether it has.",
+    );
     report.figure(bode(
         "bode",
-        "Gain and phase of the plant as measured (intervals 95 %, where they are larger than the points), and the fit, with its 95 % \
-         band if these frequencies determine it; hold, exposure and delay are taken off.",
+        "Left: gain (motion of the bead over that of the piezo) and phase of the plant, with hold, exposure and delay of the record taken \
+         off. Right: the same less the fit, with the 95 % intervals of the points and the 95 % band of the fit.",
         result,
-        (480.0, eq6),
+        Shown { high_hz: hz(points.last()), eq6, delayed: false },
     ));
     for warning in &result.warnings {
         report.note(Emphasis::Warning, warning);

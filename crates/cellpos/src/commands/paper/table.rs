@@ -11,6 +11,11 @@ use cellpos_ident::identifiability::IdentifiedParameter;
 use cellpos_ident::summary::literal_per_hertz;
 use cellpos_plant::{EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
 
+/// Within which a gain, dB, a phase, deg, and the delay, ms, agree with the paper's.
+pub(super) const GAIN_DB: f64 = 0.2;
+pub(super) const PHASE_DEG: f64 = 1.0;
+pub(super) const DELAY_MS: f64 = 0.05;
+
 fn within(value: f64, target: f64, tolerance: f64) -> bool {
     (value - target).abs() <= tolerance
 }
@@ -110,7 +115,7 @@ fn spectrum(done: &Done) -> Vec<Row> {
             &format!("{g:.2}"),
             p.gain_db,
             "dB",
-            within(p.gain_db, g, 0.2),
+            within(p.gain_db, g, GAIN_DB),
             "paper: Eq. (6) evaluated".to_owned(),
         ));
         rows.push(row(
@@ -119,7 +124,7 @@ fn spectrum(done: &Done) -> Vec<Row> {
             &format!("{a:.2}"),
             p.phase_deg,
             "deg",
-            within(p.phase_deg, a, 1.0),
+            within(p.phase_deg, a, PHASE_DEG),
             "paper: Eq. (6) evaluated; the text says about -90".to_owned(),
         ));
     }
@@ -144,7 +149,7 @@ fn delay_and_slope(done: &Done) -> Result<Vec<Row>, Failure> {
         "2",
         delay.value,
         "ms",
-        within(delay.value, 2.0, 0.05),
+        within(delay.value, 2.0, DELAY_MS),
         "one edge between two 1 ms clocks reads 2 for anything from 1 to 3 ms; 300 dithered edges here".to_owned(),
     ));
     add(row(

@@ -80,7 +80,8 @@ fn page(compared: &[Compared]) -> (Report, String) {
         (false, 1) => "\u{b1} is the 95 % interval within this one run.".to_owned(),
         (false, n) => format!(
             "\u{b1} is the 95 % interval of the mean of {n} runs, from how they differ (Student's t); first and last: ten cycles of each \
-             run. Runs of one sample that are alike tell nothing about other samples."
+             run. Runs of one sample that are alike tell nothing about other samples. Stretch: largest length over that at rest; recovery \
+             time: its time constant."
         ),
     };
     if parts.is_empty() {

@@ -31,8 +31,8 @@ impl RmsCourse {
             let pairs = self.stretches.chunks(2);
             self.stretches = pairs
                 .map(|two| {
-                    (two.iter()
-                        .fold((0.0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1)))
+                    two.iter()
+                        .fold((0.0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
                 })
                 .collect();
             self.long_s *= 2.0;

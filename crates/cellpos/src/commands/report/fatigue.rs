@@ -42,12 +42,12 @@ pub(super) fn is_whole(row: &&CycleRow) -> bool {
         && !row.flags.has(CycleFlags::RAMP)
 }
 
-/// Means of ten cycles each with their 95 % intervals: cycle, mean, low, high.
+/// Means of ten cycles each (of the last six or more) with their 95 % intervals: cycle, mean, low, high.
 pub(super) fn tens(values: &[(f64, f64)]) -> [Vec<f64>; 4] {
     const TEN: usize = 10;
     let mut columns: [Vec<f64>; 4] = Default::default();
-    for ten in values.chunks(TEN).filter(|ten| ten.len() == TEN) {
-        let cycle = ten.iter().map(|p| p.0).sum::<f64>() / TEN as f64;
+    for ten in values.chunks(TEN).filter(|ten| ten.len() > TEN / 2) {
+        let cycle = ten.iter().map(|p| p.0).sum::<f64>() / ten.len() as f64;
         let found = Mean::of(ten);
         let ends = [found.mean - found.ci95, found.mean + found.ci95];
         for (column, value) in columns
@@ -114,8 +114,16 @@ pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
     }
 }
 
-/// Why the first length differs from the others.
-pub(crate) const OF_FIRST_LENGTH: &str = "The first cycle begins with the cell at rest; before each later one the pause leaves some of the stretch.";
+/// What [`length_between`] is.
+pub(crate) const OF_LENGTH: &str = "Length at start: what the pause before a cycle leaves of the stretch; the first cycle, which begins at rest, is left out.";
+
+/// Length at the start of a cycle that follows another; NaN of the first.
+pub(crate) fn length_between(row: &CycleRow) -> f64 {
+    match row.cycle {
+        0 => f64::NAN,
+        _ => row.length_start_um,
+    }
+}
 
 /// Change of the cell over the cycles: the main figure of a run with a cell.
 pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
@@ -142,7 +150,7 @@ pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
         "fatigue",
         &format!(
             "Small points: each cycle (under the static load: as long as a cycle). Large: means of ten with their 95 % interval, where \
-             it is larger than the point. {OF_FIRST_LENGTH}{same_cell}"
+             it is larger than the point. {OF_LENGTH}{same_cell}"
         ),
     );
     let mut panels = vec![
@@ -163,7 +171,7 @@ pub(super) fn figure(rows: &[CycleRow]) -> Option<Figure> {
         ArmKind::Cyclic,
         "length at start",
         "um",
-        &|row| row.length_start_um,
+        &length_between,
     ));
     Some(panels.into_iter().fold(figure.columns(2), Figure::panel))
 }

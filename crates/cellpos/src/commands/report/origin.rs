@@ -48,6 +48,17 @@ pub(super) fn subject(meta: Option<&RunMeta>) -> &'static str {
     }
 }
 
+/// Whether the rig is one.
+pub(super) fn rig(meta: &RunMeta) -> &'static str {
+    let emulated = text_at(&meta.config, &["rig", "actuator", "kind"])
+        .is_some_and(|kind| kind.starts_with("emulated"));
+    match (emulated, meta.clock.as_str()) {
+        (true, "virtual") => "Emulated rig (a simulation, not in real time)",
+        (true, _) => "Emulated rig (a simulation, in real time)",
+        (false, _) => "On a rig",
+    }
+}
+
 /// How the loop was closed, on which rig, and when.
 fn place(meta: &RunMeta) -> String {
     let mut text = String::new();
@@ -62,13 +73,7 @@ fn place(meta: &RunMeta) -> String {
         }
         text.push_str(". ");
     }
-    let emulated = text_at(&meta.config, &["rig", "actuator", "kind"])
-        .is_some_and(|kind| kind.starts_with("emulated"));
-    text.push_str(match (emulated, meta.clock.as_str()) {
-        (true, "virtual") => "Emulated rig (a simulation), virtual clock",
-        (true, _) => "Emulated rig (a simulation), real clock",
-        (false, _) => "On a rig",
-    });
+    text.push_str(rig(meta));
     if let Some(cells) = text_at(&meta.config, &["rig", "sample", "name"]) {
         text.push_str(&format!(", sample {cells}"));
     }

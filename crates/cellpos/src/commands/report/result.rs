@@ -9,6 +9,9 @@ use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use cellpos_session::connect::ENDED;
 
+/// Two errors that are known to a fifth each differ by chance by up to this share of one of them.
+const LEARNED: f64 = 0.3;
+
 /// What came out, and how sure it is.
 pub(super) struct Said {
     pub(super) result: String,
@@ -42,13 +45,13 @@ pub(super) fn section(
             sure: String::new(),
         });
     if let Some((before_um, after_um)) = learned {
-        result.push_str(&format!(
-            " Learning brought it from {} nm in the first few cycles to {} nm in the last few.",
-            nm(before_um),
-            nm(after_um)
-        ));
+        let (before, after) = (nm(before_um), nm(after_um));
+        result.push_str(&match (after_um / before_um - 1.0).abs() < LEARNED {
+            true => format!(" Learning changed it by no more than chance ({before} nm at first, {after} nm at last)."),
+            false => format!(" Learning brought it from {before} nm at first to {after} nm at last."),
+        });
         sure.push_str(
-            " The two errors of learning are of two cycles or so, and known to some 20 %.",
+            " The two errors of learning are of two cycles or so, and known to some 20 % each.",
         );
     }
     result.push_str(&match lost {
@@ -124,6 +127,14 @@ fn change(found: &Trend) -> String {
     )
 }
 
+fn percent(found: &Trend) -> String {
+    format!(
+        " ({:+.1} %)",
+        100.0 * (found.last.mean / found.first.mean - 1.0)
+    )
+    .replace('-', "\u{2212}")
+}
+
 /// A cell over its cycles.
 fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
     let rest = AtRest::of(rows);
@@ -131,15 +142,17 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
         return of_few_cycles(rows, &rest);
     };
     let mut text = format!(
-        "The cell's stretch (largest length over the {:.2} um at rest) went {} over {} cycles",
+        "The cell's stretch (largest length over the {:.2} um at rest) went {}{} over {} cycles",
         rest.length_um,
         change(&stretch),
+        percent(&stretch),
         stretch.cycles
     );
     if let Some(recovery) = cyclic(rows, |row| row.recovery_s) {
         text.push_str(&format!(
-            ", the time constant of its recovery {} s",
-            change(&recovery)
+            ", the time constant of its recovery {} s{}",
+            change(&recovery),
+            percent(&recovery)
         ));
     }
     text.push('.');
@@ -221,23 +234,27 @@ fn possible(bound: Option<&Bound>) -> String {
     })
 }
 
-/// The motions of waves: amplitude (um), and reached over commanded amplitude of each of its cycles.
+/// The motions of waves: amplitude (half of peak to peak, um), and reached over commanded amplitude of each of its cycles.
 fn motions(rows: &[CycleRow]) -> Vec<(f64, Vec<f64>)> {
-    let mut found: Vec<(f64, Vec<f64>)> = Vec::new();
+    let mut found: Vec<(&CycleRow, Vec<f64>)> = Vec::new();
     let whole = rows.iter().filter(super::fatigue::is_whole);
     for row in whole.filter(|row| !super::cycles::was_elsewhere(row)) {
         let reached = row.reached_um / row.commanded_um;
         if !reached.is_finite() {
             continue;
         }
-        // Amplitudes are what the script commands, the same within a motion.
-        let same =
-            |(um, _): &&mut (f64, Vec<f64>)| (*um - row.commanded_um).abs() < 1e-3 * um.abs();
+        let same = |(known, _): &&mut (&CycleRow, Vec<f64>)| {
+            row.moves_as((known.stroke_um, known.duration_s))
+        };
         match found.iter_mut().find(same) {
             Some((_, values)) => values.push(reached),
-            None => found.push((row.commanded_um, vec![reached])),
+            None => found.push((row, vec![reached])),
         }
     }
+    let mut found: Vec<(f64, Vec<f64>)> = found
+        .into_iter()
+        .map(|(row, values)| (row.stroke_um, values))
+        .collect();
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     found
 }

@@ -2,6 +2,7 @@
 
 use crate::commands::report::bound::Bound;
 use crate::commands::report::cycles::{on_the_way, was_elsewhere};
+use crate::commands::report::fatigue::length_between;
 use crate::commands::report::origin;
 use crate::commands::report::recorded::Recorded;
 use crate::commands::report::session::ending;
@@ -33,7 +34,7 @@ pub(super) const CELL: [Quantity; 3] = [
     Quantity {
         name: "length at start",
         unit: "um",
-        of: |row, _| row.length_start_um,
+        of: |row, _| length_between(row),
     },
 ];
 
@@ -157,7 +158,9 @@ impl Compared {
                 .flatten(),
             ends,
             emphasis,
-            task: meta.map_or_else(String::new, |meta| origin::task(meta, &rows)),
+            task: meta.map_or_else(String::new, |meta| {
+                format!("{} {}.", origin::task(meta, &rows), origin::rig(meta))
+            }),
             started: meta.map_or_else(String::new, |meta| meta.started_utc.clone()),
             rows,
         })

@@ -2,7 +2,7 @@
 
 use super::data::{ARMS, Compared, Quantity, values};
 use crate::commands::report::cycles::with_interval;
-use crate::commands::report::fatigue::{OF_FIRST_LENGTH, tens};
+use crate::commands::report::fatigue::{OF_LENGTH, tens};
 use cellpos_report::{Axis, Column, Figure, Panel, Series, Table};
 use cellpos_script::ArmKind;
 
@@ -13,7 +13,7 @@ pub(super) fn over_cycles(compared: &[Compared], quantities: &[Quantity]) -> Fig
         &format!(
             "Each run over its cycles: means of ten cycles with the 95 % interval from the scatter within that run, where it is larger \
              than the point; every cycle of a run with fewer than twenty. The runs' points of the same cycles are drawn side by side. \
-             Cycles in which bead or cell was elsewhere than the script had it are left out. {OF_FIRST_LENGTH}"
+             Cycles in which bead or cell was elsewhere than the script had it are left out. {OF_LENGTH}"
         ),
     )
     .columns(2);

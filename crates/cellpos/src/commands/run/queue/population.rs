@@ -1,12 +1,15 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
-use crate::commands::report::{OF_FIRST_LENGTH, half95, was_elsewhere, with_interval};
+use crate::commands::report::{
+    OF_LENGTH, half95, length_between, rig_of, was_elsewhere, with_interval,
+};
 use crate::commands::run::over::Over;
 use crate::output::command_line;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, student95, trend};
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// A cell. None: not measured.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -221,8 +224,9 @@ pub(super) fn sentence(done: usize, rows: &[CellRow], cycles: &[Vec<CycleRow>]) 
                 mean(|trend| trend.last.mean),
             );
             let (change, _) = mean(|trend| 100.0 * (trend.last.mean / trend.first.mean - 1.0));
+            let change = format!("{change:+.1} %").replace('-', "\u{2212}");
             parts.push(format!(
-                "{name} from {} to {}{unit} ({change:+.1} %)",
+                "{name} from {} to {}{unit} ({change})",
                 with_interval(first.0, first.1),
                 with_interval(last.0, last.1)
             ));
@@ -257,9 +261,13 @@ fn lead(rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> String {
                 row.duration_s
             )
         });
+    let rig = match rows.first().map(|row| rig_of(Path::new(&row.run))) {
+        None | Some("") => String::new(),
+        Some(rig) => format!(" {rig}."),
+    };
     format!(
         "Task: the same script for {} cells, one after the other; {each}{of_one}. The loop moves each cell to and fro by camera and piezo \
-         (PZT), and measures how far it stretches and how fast it recovers.",
+         (PZT), and measures how far it stretches and how fast it recovers.{rig}",
         rows.len()
     )
 }
@@ -292,13 +300,13 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
     let quantities: [(&str, &str, Value); 3] = [
         ("stretch", "", |row, rest| rest.stretch(row)),
         ("recovery time", "s", |row, _| row.recovery_s),
-        ("length at start", "um", |row, _| row.length_start_um),
+        ("length at start", "um", |row, _| length_between(row)),
     ];
     let mut figure = Figure::new(
         "population",
         &format!(
             "Thin: each cell. Thick: mean over the cells with its 95 % interval (area), at each cycle that two cells or more have; how far \
-             cells differ is taken from all cycles together. Whole, undisturbed cycles. {OF_FIRST_LENGTH}"
+             cells differ is taken from all cycles together. Whole, undisturbed cycles. {OF_LENGTH}"
         ),
     )
     .columns(2);
