@@ -111,7 +111,12 @@ pub fn apply(request: &Request) -> Conditions {
                     ThreadPriority::Crossplatform(value),
                     fifo,
                 )
-                .map_err(|error| format!("{error:?}"))
+                .map_err(|error| match error {
+                    thread_priority::Error::OS(code) => {
+                        std::io::Error::from_raw_os_error(code).to_string()
+                    }
+                    other => format!("{other:?}"),
+                })
             });
         if let Err(error) = granted {
             degraded.push(format!(

@@ -6,6 +6,7 @@ mod compare;
 mod course;
 mod cycles;
 mod envelope;
+mod error_figure;
 mod fatigue;
 mod fault;
 mod montage;
@@ -100,7 +101,7 @@ fn single(run: &Path, args: &Args) -> CommandResult {
     let has_error = ticks.rms_um().is_some();
     page.figure(match of_a_cell {
         Some(figure) => figure,
-        None if has_error => result::error_figure(ticks, bound.as_ref(), &cycles.rows),
+        None if has_error => error_figure::error_figure(ticks, bound.as_ref(), &cycles.rows),
         // A run without an error still shows what happened.
         None => over_the_run(ticks),
     });
@@ -111,7 +112,11 @@ fn single(run: &Path, args: &Args) -> CommandResult {
     traces(&mut page, ticks, is_cell || has_error);
     if is_cell && has_error {
         page.section("Error");
-        page.figure(result::error_figure(ticks, bound.as_ref(), &cycles.rows));
+        page.figure(error_figure::error_figure(
+            ticks,
+            bound.as_ref(),
+            &cycles.rows,
+        ));
     }
     spectrum(&mut page, ticks, meta);
     let trends = cycles::section(&mut page, cycles, is_cell);

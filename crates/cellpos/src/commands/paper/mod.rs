@@ -20,7 +20,6 @@ use cellpos_plant::Model;
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_rig::Clock;
 use std::path::PathBuf;
-use table::{DELAY_MS, GAIN_DB, PHASE_DEG};
 
 /// Arguments of `cellpos paper`.
 #[derive(Debug, clap::Args)]
@@ -235,8 +234,11 @@ fn report(
     report.result(status, &sentence(rows));
     report.certainty(&format!(
         "one simulation, whose plant is the paper's Eq. (6): agreement shows that the method of measurement is right and the paper's numbers fit \
-         together, not that Eq. (6) is right for a real rig. Agrees: a gain within {GAIN_DB} dB, a phase within {PHASE_DEG} deg, the delay within \
-         {DELAY_MS} ms, a parameter within its interval; the table has each."
+         together, not that Eq. (6) is right for a real rig. Agrees: a gain within {} dB, a phase within {} deg, the delay within \
+         {} ms, a parameter within its interval; the table has each.",
+        row::GAIN_DB,
+        row::PHASE_DEG,
+        row::DELAY_MS
     ));
     report.figure(plots::bode(
         "fig7-bode",

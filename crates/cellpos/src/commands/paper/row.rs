@@ -5,6 +5,11 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::Path;
 
+/// Within which a gain, dB, a phase, deg, and the delay, ms, agree with the paper's.
+pub(super) const GAIN_DB: f64 = 0.2;
+pub(super) const PHASE_DEG: f64 = 1.0;
+pub(super) const DELAY_MS: f64 = 0.05;
+
 /// One row.
 pub(super) struct Row {
     /// Key for machines.

@@ -2,7 +2,7 @@
 
 use super::Drifting;
 use super::figures::Recorded;
-use super::row::{Row, row, wrong};
+use super::row::{DELAY_MS, GAIN_DB, PHASE_DEG, Row, row, wrong};
 use crate::commands::identify::report::number;
 use crate::outcome::Failure;
 use cellpos_experiment::identify::Done;
@@ -10,11 +10,6 @@ use cellpos_ident::excitation::{PAPER_FREQUENCIES_HZ, check_grid};
 use cellpos_ident::identifiability::IdentifiedParameter;
 use cellpos_ident::summary::literal_per_hertz;
 use cellpos_plant::{EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
-
-/// Within which a gain, dB, a phase, deg, and the delay, ms, agree with the paper's.
-pub(super) const GAIN_DB: f64 = 0.2;
-pub(super) const PHASE_DEG: f64 = 1.0;
-pub(super) const DELAY_MS: f64 = 0.05;
 
 fn within(value: f64, target: f64, tolerance: f64) -> bool {
     (value - target).abs() <= tolerance
