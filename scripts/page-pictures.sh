@@ -6,7 +6,10 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 to=${1:-target/page-pictures}
-cargo test --locked --workspace --test all live_page::last_word:: -- --ignored --test-threads 1
+# The tests find the programs beside themselves.
+cargo build --locked -p cellpos --bins
+cargo build --locked -p cellpos-firmware-sim --bins
+cargo test --locked -p cellpos-tests --test all live_page::last_word:: -- --ignored --test-threads 1
 mkdir -p "$to"
 cp target/debug/live-page/{screen,word}-*.png "$to/"
 ls "$to"

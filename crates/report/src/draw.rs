@@ -91,22 +91,24 @@ fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_p
         let last_row = (row_index + 1) * columns >= panels.len();
         let mut tallest: f64 = 0.0;
         let inner = width - LEFT_PX - RIGHT_PX;
-        let heads = row.iter().map(|panel| head_px(panel, &told, inner));
-        let head_px = heads.fold(0.0, f64::max);
+        let mut of_row = told.clone();
+        let mut head = 0.0_f64;
+        for panel in row {
+            head = head.max(head_px(panel, &of_row, inner));
+            of_row.extend(entries(panel));
+        }
         for (column, panel) in row.iter().enumerate() {
             let frame = Frame {
                 left: column as f64 * width + LEFT_PX,
                 top,
                 width: inner,
-                head_px,
+                head_px: head,
                 x_range: shared.unwrap_or_else(|| data_range(panel, true)),
                 show_x: !(figure.share_x && columns == 1) || last_row,
                 told: &told,
             };
             tallest = tallest.max(draw_panel(drawing, panel, &frame));
-            if columns == 1 {
-                told.extend(entries(panel));
-            }
+            told.extend(entries(panel));
         }
         top += tallest;
     }

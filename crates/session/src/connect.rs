@@ -280,7 +280,7 @@ pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
     /// Fewer ticks are of the first frames, which waited for the loop to begin.
     const FEWEST_TICKS: u64 = 100;
     // Without a frame that was used nothing is known of their age: the delay is that of the hold alone.
-    if summary.exposure_to_command_us.max <= 0.0 || summary.ticks < FEWEST_TICKS {
+    if summary.exposure_to_command_us.max <= 0.0 || summary.counts.ticks < FEWEST_TICKS {
         return None;
     }
     let found_ms = summary.loop_delay_ms - 0.5e-3 * file.timing.period_us;

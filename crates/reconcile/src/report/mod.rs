@@ -79,7 +79,8 @@ fn waterfall(r: &mut Report, result: &Reconciliation) {
         .filter(|(i, s)| *i == 0 || !s.effects.is_empty())
         .map(|(_, s)| s)
         .collect();
-    if steps.len() < 2 {
+    // One step has the numbers of the answer, no course.
+    if steps.len() < 3 {
         return;
     }
     let names: Vec<String> = steps

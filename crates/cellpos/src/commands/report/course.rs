@@ -52,6 +52,20 @@ impl RmsCourse {
         self.long_s
     }
 
+    /// Mean squares of whole pieces of at least this length, from the stretches without a gap.
+    pub(super) fn pieces(&self, least_s: f64) -> Vec<f64> {
+        let full = self.stretches.iter().map(|one| one.1).max().unwrap_or(0);
+        // A tick more or less is chance.
+        let whole: Vec<f64> = (self.stretches.iter())
+            .filter(|(_, count)| 10 * count >= 9 * full && *count > 0)
+            .map(|(sum, count)| sum / *count as f64)
+            .collect();
+        let joined = (least_s / self.long_s).ceil().clamp(1.0, 1e6) as usize;
+        (whole.chunks_exact(joined))
+            .map(|piece| piece.iter().sum::<f64>() / joined as f64)
+            .collect()
+    }
+
     /// RMS of each stretch at its middle; a gap where there was no value.
     pub(super) fn series(&self, label: &str) -> Series {
         let (x, y): (Vec<f64>, Vec<f64>) = (self.stretches.iter().enumerate())
@@ -87,5 +101,8 @@ mod tests {
             .fold((0.0, 0), |all, one| (all.0 + one.0, all.1 + one.1));
         assert_eq!((sum, count), (1770.0, 3540));
         assert_eq!(course.stretches.first(), Some(&(0.0, 0)));
+        // Pieces of a minute: the squares are 0 and 1 in turn.
+        let pieces = course.pieces(60.0);
+        assert!(pieces.len() > 40 && pieces.iter().all(|square| (square - 0.5).abs() < 0.02));
     }
 }

@@ -111,7 +111,7 @@ pub(super) fn task(meta: &RunMeta, rows: &[CycleRow]) -> String {
             format!("Task: move a {what} to and fro on a sine, {um} um to each side at {hz} Hz.")
         }
         _ => match number("position_um") {
-            Some(um) => format!("Task: hold a {what} at {um} um."),
+            Some(um) => format!("Task: hold a {what} at {um} um along the channel."),
             None => format!("Task: {kind}."),
         },
     }

@@ -1,6 +1,7 @@
 //! Figures of a report, gathered in one pass over the ticks.
 
 use super::course::RmsCourse;
+use super::cycles::half95;
 use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::{Decades, Spread};
@@ -57,6 +58,8 @@ pub(super) struct Ticks {
     pub error: Envelope<1>,
     /// Its RMS over the run from the first closing of the loop on, nm.
     pub rms_nm: RmsCourse,
+    /// The same of the errors that count.
+    counted_nm: RmsCourse,
     /// Whether the target moved while the error counted.
     pub target_moves: bool,
     counted_target_um: Option<f64>,
@@ -175,6 +178,7 @@ impl Ticks {
         let first_um = *self.counted_target_um.get_or_insert(r.target_um);
         self.target_moves |= (r.target_um - first_um).abs() > 1e-9;
         self.error_nm.add(r.error_um * 1e3);
+        self.counted_nm.add(time_s, r.error_um * 1e3);
         self.error_um.add(r.error_um);
         if r.variance_um2.is_finite() {
             self.variance_um2.0 += r.variance_um2;
@@ -264,9 +268,17 @@ impl Ticks {
         (n > 0.0).then(|| (sum / n).sqrt() * 1e-3)
     }
 
-    /// Half the 95 % interval of that RMS, um. The variance of a record of the length T has the variance 1/T times the integral of
-    /// the squared one-sided power density (Bartlett).
+    /// Half the 95 % interval of that RMS, um. The variance of noise in a record of the length T has the variance 1/T times the integral
+    /// of the squared one-sided power density (Bartlett). An error that goes with a moving target is no such noise: there it is the
+    /// scatter between pieces of the record, each of whole periods.
     pub(super) fn rms_ci95_um(&self) -> Option<f64> {
+        if self.target_moves {
+            let period_s = self.period_rows() * self.period_s();
+            let least_s = if period_s.is_finite() { period_s } else { 0.0 };
+            let pieces = self.counted_nm.pieces(least_s);
+            let half = half95(&pieces) / (2.0 * self.rms_um()? * 1e3);
+            return half.is_finite().then_some(half * 1e-3);
+        }
         let spectrum = self.error_um.spectrum(self.period_s())?;
         let [first, second, ..] = spectrum.hz.as_slice() else {
             return None;
