@@ -70,9 +70,10 @@ fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
     let page = report(&result, "labelled").to_html();
     let text = page.split("<body").nth(1).unwrap();
     let order = [
-        "The model lacks time-delay at the camera, delay = ",
-        "With that the prediction error on held-out records falls from",
-        "Prediction error of all records as the search went on",
+        "The model lacks: time-delay at the camera, delay = ",
+        "With that the prediction error on records that the fit had not seen falls from",
+        "How sure:",
+        "Where the prediction error is: its part in each frequency band",
         "The effects in numbers",
         "Records and noise",
     ];
