@@ -373,7 +373,7 @@ fn innovations(r: &mut Report, result: &Reconciliation) {
         Figure::new(
             "spectrum",
             &format!(
-                "Where the prediction error is: its part in each frequency band, of the model as it was and with the effects added, and the part \
+                "Prediction error by frequency band: the part of each band, of the model as it was and with the effects added, and the part \
                  that noise alone has (points; by chance a band is a little below it). The squares of the parts add up to the square of the \
                  whole: {} before, {} after, {} of noise, of all records together, each counting alike.",
                 whole(|b| b.before),

@@ -73,7 +73,7 @@ fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
         "The model lacks: time-delay at the camera, delay = ",
         "With that the prediction error on records that the fit had not seen falls from",
         "How sure:",
-        "Where the prediction error is: its part in each frequency band",
+        "Prediction error by frequency band: the part of each band",
         "The effects in numbers",
         "Records and noise",
     ];
