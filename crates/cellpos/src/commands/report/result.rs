@@ -42,7 +42,7 @@ pub(super) fn section(
         .or_else(|| of_a_hold(ticks, bound, what, ended.is_none()))
         .unwrap_or_else(|| Said {
             result: "The loop was not closed long enough for an error to be stated.".to_string(),
-            sure: String::new(),
+            sure: "nothing was measured of which it could be said.".to_string(),
         });
     if let Some((before_um, after_um)) = learned {
         let (before, after) = (nm(before_um), nm(after_um));
@@ -66,9 +66,7 @@ pub(super) fn section(
         result.push_str(&format!(" The run did not end as planned: {ended}."));
     }
     page.result(status, &result);
-    if !sure.is_empty() {
-        page.certainty(&sure);
-    }
+    page.certainty(&sure);
     result
 }
 
