@@ -73,6 +73,7 @@ struct State {
     /// The newest position that was used and the ticks that it is older than the camera path, for those in between.
     newest: Option<(f64, u16)>,
     early_since_ns: Option<i64>,
+    near_limit: bool,
     vision_slow_since_ns: Option<i64>,
     coasting_since_ns: Option<i64>,
     frozen: FreezeReasons,
@@ -213,6 +214,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 frameless: 0,
                 newest: None,
                 early_since_ns: None,
+                near_limit: false,
                 vision_slow_since_ns: None,
                 coasting_since_ns: None,
                 frozen: FreezeReasons::default(),

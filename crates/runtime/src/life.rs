@@ -203,8 +203,7 @@ pub enum EventKind {
         /// Half width of its 95 % interval.
         ci95: f64,
     },
-    /// Ticks were skipped or frames came late during the pulse, or its interval leaves a doubt, and the plant would be
-    /// refused: the pulse is made again and fitted together with this one.
+    /// A refusal is in doubt (skipped ticks, late frames, a wide interval): the pulse is made again and fitted together with this one.
     ArmingRepeated {
         /// What the answer would have meant.
         refusal: Refusal,
@@ -292,6 +291,8 @@ pub enum EventKind {
     },
     /// The camera began to count its frames anew: it was restarted. Frames lost meanwhile are not known by number.
     CameraRestarted,
+    /// Noise, focus or blur come near the end of the range that the settings of vision hold for.
+    NearLimit,
     /// Vision took a bead after the one followed had been lost: like it in size and brightness, but it may be another.
     BeadReacquired {
         /// Where.

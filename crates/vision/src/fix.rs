@@ -37,6 +37,9 @@ pub struct Fix {
     pub residual_ratio: f64,
     /// Peak contrast over the noise of one pixel.
     pub snr: f64,
+    /// How much of the range that the settings hold for is used up: near 0 for a bead like those they were made for, 1 where a bead
+    /// is no longer a good fix. The larger of the shares that noise and shape use. Measured for good fixes.
+    pub range_used: f64,
     /// Whether the fix can be used.
     pub verdict: FixQuality,
 }
@@ -54,6 +57,7 @@ impl Fix {
             background: 0.0,
             residual_ratio: 0.0,
             snr: 0.0,
+            range_used: 0.0,
             verdict,
         }
     }

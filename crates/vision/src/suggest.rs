@@ -9,6 +9,7 @@ use crate::fix::FixQuality;
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::objects::{Flat, Object, Refused};
+use crate::range::Range;
 use crate::smooth::{Learnt, Parametric, Rings};
 use crate::template::{ProfileSpec, TABLE_KNOTS, Template};
 
@@ -50,6 +51,8 @@ pub struct Suggestion {
     pub refused: Refused,
     /// Median of the beads' peak contrast over the noise.
     pub snr: f64,
+    /// What the settings hold for, tried with beads drawn from their template; `None` where they do not find these.
+    pub range: Option<Range>,
 }
 
 /// Why there is no suggestion.
@@ -215,7 +218,9 @@ fn learn(
         (TOLERANCE_MARGIN * needed).clamp(rough.template_tolerance, MOST_TOLERANCE);
     config.min_snr = (ROOM_FOR_NOISE * snr).clamp(3.0, 20.0);
     let max_step_px = step_px(&fits, reach_px);
+    let range = Range::of(&config, snr);
     Ok(Suggestion {
+        range,
         config,
         max_step_px,
         objects,

@@ -35,6 +35,7 @@ WORDS: Dict[str, Dict[int, str]] = {
                 "stale",
                 "stays",
                 "in-contact",
+                "near-limit",
             )
         )
     ),

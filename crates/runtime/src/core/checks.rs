@@ -130,6 +130,11 @@ impl<R: ReferenceGenerator> Core<R> {
             tick.flags.set(TickFlags::LOST);
             return None;
         }
+        let near_limit = matches!(m.track, Some((_, Decision::NearLimit)));
+        if near_limit && !self.state.near_limit {
+            tick.event(EventKind::NearLimit);
+        }
+        self.state.near_limit = near_limit;
         if matches!(m.track, Some((_, Decision::Reacquired))) {
             tick.event(EventKind::BeadReacquired {
                 position_um: m.position_um,

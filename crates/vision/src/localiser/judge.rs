@@ -1,5 +1,6 @@
 //! What a fit is worth: its verdict, and the variance of its place.
 
+use super::certainty::LEAST_SIGNIFICANCE;
 use super::{Fitted, Localiser, NARROW_RADII};
 use crate::beyond::Left;
 use crate::config::PixelNoise;
@@ -60,8 +61,33 @@ impl Localiser {
             background,
             residual_ratio,
             snr,
+            range_used: 0.0,
             verdict,
         }
+    }
+
+    /// How much of the range for which there is a good fix is used up by a good one whose contrast has a standard deviation.
+    pub(super) fn range_used(&self, fix: &Fix, contrast_sd: f64) -> f64 {
+        let noise = self.config.min_snr / fix.snr;
+        let noise = noise.max(LEAST_SIGNIFICANCE * contrast_sd / (self.sign * fix.amplitude));
+        let left = (fix.residual_ratio - 1.0).max(0.0);
+        let by_template = left / (self.tolerated(fix.snr) - 1.0);
+        let shape = if self.comb.is_still() {
+            let (explained, _) = self.explained(fix);
+            let by_ring = left / ((1.0 - LEAST_EXPLAINED) * (explained + left));
+            // A lopsided rest is not part of the ring; where that was asked, it is known.
+            by_template.min(by_ring.max(self.lopsided))
+        } else {
+            by_template
+        };
+        noise.max(shape)
+    }
+
+    /// What the template explains of what the bead adds to the window, and what it leaves, in variances of the noise.
+    fn explained(&self, fix: &Fix) -> (f64, f64) {
+        let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
+        let left = (fix.residual_ratio - 1.0).max(0.0);
+        (filled * MEASURED * fix.snr * fix.snr, left)
     }
 
     /// Residual ratio up to which a template's error explains the residual of a bead of this contrast over the noise.
@@ -90,9 +116,7 @@ impl Localiser {
     /// most of what the bead adds to the window.
     pub(super) fn pardon(&mut self, frame: &Frame, fix: &mut Fix) {
         let variance = self.pixel_variance(fix.background);
-        let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
-        let explained = filled * MEASURED * fix.snr * fix.snr;
-        let left = (fix.residual_ratio - 1.0).max(0.0);
+        let (explained, left) = self.explained(fix);
         if !self.comb.is_still() || explained < LEAST_EXPLAINED * (explained + left) {
             return;
         }
@@ -104,7 +128,8 @@ impl Localiser {
             (fix.x_px, fix.y_px),
             (fix.amplitude, background),
         );
-        if lopsided / variance <= self.tolerated(fix.snr) {
+        self.lopsided = lopsided / variance / self.tolerated(fix.snr);
+        if self.lopsided <= 1.0 {
             fix.verdict = self.whole(frame, (fix.x_px, fix.y_px));
         }
     }

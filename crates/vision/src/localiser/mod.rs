@@ -58,8 +58,9 @@ pub struct Localiser {
     residues: Residues,
     /// Whether specks that show without knowing the bead are replaced in the windows of this fix.
     cleans: bool,
-    /// Whether a residual that is the same all round counts as none.
+    /// Whether a residual that is the same all round counts as none, and how much of what may be lopsided was in the last one asked.
     pardons: bool,
+    lopsided: f64,
     /// How much of a window the bead fills: the whole window, and the narrow one.
     filled: [f64; 2],
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
@@ -104,6 +105,7 @@ impl Localiser {
             residues: Residues::new(),
             cleans: false,
             pardons: false,
+            lopsided: 0.0,
             filled,
             local: Pool::default(),
             lines: [Pool::default(); 2],
@@ -232,6 +234,7 @@ impl Localiser {
         self.comb = Comb::new(self.streak_px, self.template.radius_px());
         self.template.stretch_to(1.0);
         self.cleans = false;
+        self.lopsided = 0.0;
         if !self.take_window(frame, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, FixQuality::AtBorder);
         }
@@ -256,6 +259,10 @@ impl Localiser {
             && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
         {
             fix.verdict = FixQuality::NoSignal;
+        }
+        if let Some(pass) = found.filter(|_| fix.verdict == FixQuality::Good) {
+            let variance = self.weight_unit() * widening * pass.amplitude_variance;
+            fix.range_used = self.range_used(&fix, variance.sqrt());
         }
         let whole = side_px == self.config.window_px && self.comb.is_still();
         if fix.verdict == FixQuality::Good && self.comb.is_still() {

@@ -224,6 +224,7 @@ impl Localiser {
                 background,
                 residual_ratio,
                 snr: snr(bead),
+                range_used: 0.0,
                 verdict,
             };
         }

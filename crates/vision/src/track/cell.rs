@@ -320,6 +320,7 @@ fn fix(cell: &Cell, decision: Decision) -> Fix {
         background: 0.0,
         residual_ratio: f64::NAN,
         snr: cell.snr,
+        range_used: 0.0,
         verdict: match decision {
             Decision::Merged | Decision::InContact => FixQuality::BadFit,
             _ if cell.at_border => FixQuality::AtBorder,

@@ -258,6 +258,8 @@ pub enum Decision {
     Stays = 14,
     /// Another cell touches it, so that its size is not its own.
     InContact = 15,
+    /// The fix was taken, but noise, focus or blur near the end of the range that the settings hold for: beyond it there is no fix.
+    NearLimit = 16,
 }
 
 impl Decision {
@@ -281,6 +283,7 @@ impl Decision {
             Stale,
             Stays,
             InContact,
+            NearLimit,
         ]
         .into_iter()
         .find(|decision| *decision as u8 == number)
@@ -290,7 +293,7 @@ impl Decision {
     pub fn is_accepted(self) -> bool {
         matches!(
             self,
-            Decision::Accepted | Decision::Regained | Decision::Reacquired
+            Decision::Accepted | Decision::Regained | Decision::Reacquired | Decision::NearLimit
         )
     }
 }
@@ -333,7 +336,7 @@ mod tests {
             }
         }
         assert_eq!((0..=255).filter_map(TrackState::from_number).count(), 4);
-        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 16);
+        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 17);
     }
 
     #[test]

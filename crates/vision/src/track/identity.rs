@@ -15,6 +15,8 @@ pub(crate) struct Identity {
     residual: f64,
     size: Option<f64>,
     fixes: f64,
+    /// Fixes since the size was measured last.
+    unmeasured: f64,
 }
 
 impl Identity {
@@ -24,6 +26,7 @@ impl Identity {
             residual: fix.residual_ratio,
             size: size.map(|s| s.0),
             fixes: 1.0,
+            unmeasured: 0.0,
         }
     }
 
@@ -38,15 +41,25 @@ impl Identity {
         fix: &Fix,
         size: Option<(f64, f64)>,
     ) -> bool {
-        let amplitude = (fix.amplitude / self.amplitude - 1.0).abs() <= config.max_amplitude_change;
-        let residual = fix.residual_ratio <= config.max_residual_growth * self.residual.max(1.0);
+        self.change_used(config, fix, size) <= 1.0
+    }
+
+    /// How much of the changes that are allowed a fix has used up: 1 for what is just not another bead.
+    pub(super) fn change_used(
+        &self,
+        config: &TrackerConfig,
+        fix: &Fix,
+        size: Option<(f64, f64)>,
+    ) -> f64 {
+        let amplitude = (fix.amplitude / self.amplitude - 1.0).abs() / config.max_amplitude_change;
+        let residual = fix.residual_ratio / (config.max_residual_growth * self.residual.max(1.0));
         let size = match (self.size, size) {
             (Some(own), Some((other, sd))) => {
-                (other / own - 1.0).abs() <= config.max_size_change + SIZE_SIGMA * sd
+                (other / own - 1.0).abs() / (config.max_size_change + SIZE_SIGMA * sd)
             }
-            _ => true,
+            _ => 0.0,
         };
-        amplitude && residual && size
+        amplitude.max(residual).max(size)
     }
 
     /// Follows slow changes of light and focus.
@@ -55,8 +68,12 @@ impl Identity {
         let share = FORGETTING.max(1.0 / self.fixes);
         self.amplitude += share * (fix.amplitude - self.amplitude);
         self.residual += share * (fix.residual_ratio - self.residual);
+        self.unmeasured += 1.0;
         if let Some((other, _)) = size {
+            // As fast as the others, however seldom it is measured.
+            let share = (self.unmeasured * share).min(1.0);
             self.size = Some(self.size.map_or(other, |own| own + share * (other - own)));
+            self.unmeasured = 0.0;
         }
     }
 }

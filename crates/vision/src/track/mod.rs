@@ -32,6 +32,11 @@ use standing::{Chosen as Sighted, Standing};
 /// Frames between measurements of the size while tracking.
 const SIZE_STRIDE: u32 = 8;
 
+/// Share of what noise, shape and change may be, a mean over the last fixes, from which the end is near, and below which it no longer
+/// is; and the share of a new fix in the mean.
+const NEAR_LIMIT: (f64, f64) = (0.7, 0.6);
+const NEAR_FORGETTING: f64 = 1.0 / 32.0;
+
 /// Share of the chosen bead's amplitude below which a candidate is not a bead.
 const LEAST_SHARE: f64 = 0.3;
 
@@ -60,6 +65,9 @@ pub struct Tracker {
     streak_px: (f64, f64),
     exposure_s: f64,
     candidates: [Option<Candidate>; MAX_BEADS],
+    /// Share of what may be that the last fixes have used, and whether the end is near.
+    used: f64,
+    near_limit: bool,
 }
 
 impl Tracker {
@@ -83,6 +91,8 @@ impl Tracker {
             streak_px: (0.0, 0.0),
             exposure_s: 0.0,
             candidates: [None; MAX_BEADS],
+            used: 0.0,
+            near_limit: false,
         })
     }
 
@@ -139,6 +149,10 @@ impl Tracker {
             }
             (Some(frame), Some(chosen)) => self.follow(frame, chosen, time_s),
         };
+        let decision = match decision {
+            Decision::Accepted if self.near_limit => Decision::NearLimit,
+            other => other,
+        };
         let sighted = |chosen: Chosen| Sighted {
             motion: chosen.motion,
             confirmed: chosen.confirmed >= self.config.confirm_frames,
@@ -151,6 +165,13 @@ impl Tracker {
             neighbours: self.neighbours.count() as u8,
             ..step
         }
+    }
+
+    /// Takes a fix into the mean of what is used up.
+    fn take_use(&mut self, used: f64) {
+        self.used += NEAR_FORGETTING * (used - self.used);
+        let (from, below) = NEAR_LIMIT;
+        self.near_limit = self.used > if self.near_limit { below } else { from };
     }
 
     fn search(&mut self, frame: &Frame, time_s: f64) -> (Decision, Option<Fix>) {
@@ -350,6 +371,8 @@ impl Tracker {
     }
 
     fn take(&mut self, mut chosen: Chosen, c: &Candidate, time_s: f64) {
+        let changed = chosen.identity.change_used(&self.config, &c.fix, c.size);
+        self.take_use(changed.max(c.fix.range_used));
         chosen.motion.update(&c.fix);
         chosen.identity.update(&c.fix, c.size);
         chosen.last_fix_s = time_s;

@@ -9,6 +9,7 @@ mod detector;
 mod learnt;
 mod measured_beads;
 mod no_allocation;
+mod range;
 mod real_cells;
 mod streak;
 mod stress;

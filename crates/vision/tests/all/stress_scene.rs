@@ -244,20 +244,22 @@ impl Picture {
     }
 }
 
-fn blur(grey: &mut [f64], sd: f64) {
+/// Blurs a square picture by a Gaussian.
+pub(crate) fn blur(grey: &mut [f64], sd: f64) {
+    let side = grey.len().isqrt();
     let reach = (3.5 * sd).ceil() as isize;
     let kernel: Vec<f64> = (-reach..=reach)
         .map(|k| (-0.5 * (k as f64 / sd).powi(2)).exp())
         .collect();
     let sum: f64 = kernel.iter().sum();
-    for (along, across) in [(1, SIDE), (SIDE, 1)] {
-        for line in 0..SIDE {
-            let values: Vec<f64> = (0..SIDE).map(|k| grey[line * across + k * along]).collect();
-            for k in 0..SIDE as isize {
+    for (along, across) in [(1, side), (side, 1)] {
+        for line in 0..side {
+            let values: Vec<f64> = (0..side).map(|k| grey[line * across + k * along]).collect();
+            for k in 0..side as isize {
                 let near = kernel
                     .iter()
                     .zip(-reach..)
-                    .map(|(w, d)| w * values[(k + d).clamp(0, SIDE as isize - 1) as usize]);
+                    .map(|(w, d)| w * values[(k + d).clamp(0, side as isize - 1) as usize]);
                 grey[line * across + k as usize * along] = near.sum::<f64>() / sum;
             }
         }

@@ -235,7 +235,7 @@ fn kinds() -> [(String, Box<dyn RadialProfile>); 9] {
     ]
 }
 
-/// Prints the rows in their order, and asserts that each keeps its limits. Each core takes the next row that none has.
+/// Prints the rows as they are done, and asserts that each keeps its limits. Each core takes the next row that none has.
 fn run(rows: &[(usize, f64, Settings, Spoil)], beads: f64) {
     let next = AtomicUsize::new(0);
     let lines = Mutex::new(vec![None; rows.len()]);
@@ -247,6 +247,7 @@ fn run(rows: &[(usize, f64, Settings, Spoil)], beads: f64) {
                 break;
             };
             let row = row(&kinds[kind], snr, settings, spoil, beads);
+            println!("{}", row.0);
             lines.lock().unwrap()[k] = Some(row);
         }
     };
@@ -258,7 +259,6 @@ fn run(rows: &[(usize, f64, Settings, Spoil)], beads: f64) {
     });
     let mut failed = Vec::new();
     for (line, fine) in lines.into_inner().unwrap().into_iter().flatten() {
-        println!("{line}");
         if !fine {
             failed.push(line);
         }

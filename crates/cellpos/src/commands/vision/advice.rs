@@ -22,6 +22,42 @@ pub(crate) struct Advice {
     pub radius_px: f64,
     /// Radius that was given, px.
     pub given_px: Option<f64>,
+    /// What the settings hold for.
+    pub range: Option<HoldsFor>,
+}
+
+/// What settings hold for: nine in ten beads are found, each of these alone changed so far.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(crate) struct HoldsFor {
+    /// Contrast over the noise of the beads looked at.
+    pub snr: f64,
+    /// Contrast over the noise down to which beads are found.
+    pub least_snr: f64,
+    /// Smallest and largest image of the bead in another focus, relative to this one.
+    pub size: [f64; 2],
+    /// Blur, px (standard deviation).
+    pub blur_px: f64,
+}
+
+impl HoldsFor {
+    fn of(found: &Suggestion) -> Option<Self> {
+        let range = found.range?;
+        Some(Self {
+            snr: found.snr,
+            least_snr: range.snr,
+            size: [range.size.0, range.size.1],
+            blur_px: range.blur_px,
+        })
+    }
+
+    fn sentence(&self) -> String {
+        let [smaller, larger] = self.size.map(|size| 100.0 * (size - 1.0));
+        format!(
+            "holds for: contrast over noise from {:.1} up (these beads: {:.1}); out of focus until the image is {:.0} % smaller or {larger:.0} % \
+             larger; blur up to {:.1} px",
+            self.least_snr, self.snr, -smaller, self.blur_px
+        )
+    }
 }
 
 impl Advice {
@@ -40,6 +76,7 @@ impl Advice {
             bad_fit: found.refused.bad_fit,
             radius_px,
             given_px,
+            range: HoldsFor::of(found),
         }
     }
 
@@ -65,14 +102,19 @@ impl Advice {
             .map_or(String::new(), |px| format!(" (given: {px:.2} px)"));
         let mut text = format!(
             "settings found: {} of {} objects are beads of radius {:.2} px{given}; {} of another size or contrast, {} at the border, \
-             {} not round like these\n{}\npaste into rig.toml:\n\n",
+             {} not round like these\n{}\n{}\npaste into rig.toml:\n\n",
             self.taken,
             self.objects,
             self.radius_px,
             self.other,
             self.at_border,
             self.bad_fit,
-            self.profile()
+            self.profile(),
+            self.range.as_ref().map_or_else(
+                || "holds for: not known; beads drawn from these settings are not found with them"
+                    .to_string(),
+                HoldsFor::sentence
+            )
         );
         text.push_str(&vision_table(&self.vision));
         text

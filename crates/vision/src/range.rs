@@ -1,0 +1,188 @@
+//! The range that settings hold for, found by trying: beads as the template has them are drawn larger, smaller, blurred and in more
+//! noise, until the localiser no longer finds nine in ten.
+
+use crate::config::LocaliserConfig;
+use crate::fix::FixQuality;
+use crate::frame::{Frame, Pixels};
+use crate::localiser::Localiser;
+
+/// Beads of a trial, and how many of them have to be found.
+const BEADS: usize = 20;
+const FOUND: usize = 18;
+/// Contrast and background of the beads drawn, grey levels.
+const CONTRAST: f32 = 4000.0;
+const BACKGROUND: f32 = 20_000.0;
+/// Steps in which the range is tried, and the farthest that is asked for: size as a fraction, blur in radii of the bead, noise as a
+/// factor.
+const SIZE: (f64, f64) = (0.05, 0.5);
+const BLUR: (f64, f64) = (0.1, 2.0);
+const NOISE: (f64, f64) = (1.25, 20.0);
+
+/// What settings hold for: nine in ten beads are a good fix, each alone changed so far.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Range {
+    /// Smallest and largest image of the bead, as another focus makes it, relative to the template.
+    pub size: (f64, f64),
+    /// Blur, px: standard deviation of a Gaussian.
+    pub blur_px: f64,
+    /// Contrast over the noise of a pixel down to which beads are found.
+    pub snr: f64,
+}
+
+/// How a bead is drawn.
+#[derive(Debug, Clone, Copy)]
+struct Drawn {
+    size: f64,
+    blur_px: f64,
+    snr: f64,
+}
+
+impl Range {
+    /// The range of settings for beads of a contrast over the noise. `None` if they do not find such beads.
+    pub fn of(config: &LocaliserConfig, snr: f64) -> Option<Self> {
+        let radius_px = config.template().ok()?.radius_px();
+        let own = Drawn {
+            size: 1.0,
+            blur_px: 0.0,
+            snr,
+        };
+        let mut trial = Trial::new(config)?;
+        if !trial.holds(own) {
+            return None;
+        }
+        let mut farthest = |(step, most): (f64, f64), changed: &dyn Fn(f64) -> Drawn| {
+            let count = (most / step).round() as usize;
+            let amounts = (1..=count).map(|k| k as f64 * step);
+            let held = amounts.take_while(|amount| trial.holds(changed(*amount)));
+            held.last().unwrap_or(0.0)
+        };
+        let smaller = farthest(SIZE, &|by| Drawn {
+            size: 1.0 - by,
+            ..own
+        });
+        let larger = farthest(SIZE, &|by| Drawn {
+            size: 1.0 + by,
+            ..own
+        });
+        let blur = farthest(BLUR, &|radii| Drawn {
+            blur_px: radii * radius_px,
+            ..own
+        });
+        let steps = (1.0, (NOISE.1.ln() / NOISE.0.ln()).round());
+        let noise = farthest(steps, &|step| Drawn {
+            snr: snr / NOISE.0.powf(step),
+            ..own
+        });
+        Some(Range {
+            size: (1.0 - smaller, 1.0 + larger),
+            blur_px: blur * radius_px,
+            snr: snr / NOISE.0.powf(noise),
+        })
+    }
+}
+
+/// Draws beads and looks for them.
+struct Trial {
+    config: LocaliserConfig,
+    side: usize,
+    state: u64,
+}
+
+impl Trial {
+    fn new(config: &LocaliserConfig) -> Option<Self> {
+        let mut config = config.clone();
+        config.learning = None;
+        // Grey levels of a camera that was calibrated are not those drawn here.
+        config.noise = crate::PixelNoise::Estimated;
+        let side = 2 * config.window_px + 5;
+        (side < 1000).then_some(Trial {
+            config,
+            side,
+            state: 0x9E37_79B9_7F4A_7C15,
+        })
+    }
+
+    fn holds(&mut self, drawn: Drawn) -> bool {
+        let Ok(mut localiser) = Localiser::new(self.config.clone()) else {
+            return false;
+        };
+        self.state = 0x9E37_79B9_7F4A_7C15;
+        let mut found = 0;
+        for n in 0..BEADS {
+            let middle = 0.5 * (self.side - 1) as f64;
+            let place = (middle + self.uniform() - 0.5, middle + self.uniform() - 0.5);
+            let pixels = self.picture(&localiser, place, drawn);
+            let frame = Frame {
+                width: self.side,
+                height: self.side,
+                pixels: Pixels::Mono16(&pixels),
+            };
+            // As a loop that expects the bead to within a pixel.
+            let guess = (
+                place.0 + self.uniform() - 0.5,
+                place.1 + self.uniform() - 0.5,
+            );
+            let fix = localiser.locate(&frame, Some(guess));
+            let off_px = f64::hypot(fix.x_px - place.0, fix.y_px - place.1);
+            let near = off_px < 0.5 * localiser.template().radius_px();
+            found += usize::from(fix.verdict == FixQuality::Good && near);
+            if found + BEADS - n - 1 < FOUND {
+                return false;
+            }
+        }
+        true
+    }
+
+    fn picture(&mut self, localiser: &Localiser, (x, y): (f64, f64), drawn: Drawn) -> Vec<u16> {
+        let (side, template) = (self.side, localiser.template());
+        let contrast = CONTRAST * localiser.sign() as f32;
+        let mut light: Vec<f32> = (0..side * side)
+            .map(|k| {
+                let (dx, dy) = ((k % side) as f64 - x, (k / side) as f64 - y);
+                let r2 = (dx * dx + dy * dy) / (drawn.size * drawn.size);
+                contrast * template.value_at_squared(r2 as f32)
+            })
+            .collect();
+        if drawn.blur_px > 0.0 {
+            blur(&mut light, side, drawn.blur_px);
+        }
+        let noise = f64::from(CONTRAST) / drawn.snr;
+        light
+            .iter()
+            .map(|v| (BACKGROUND + v + (noise * self.normal()) as f32).round() as u16)
+            .collect()
+    }
+
+    /// Numbers that are the same each time: xorshift64*.
+    fn uniform(&mut self) -> f64 {
+        self.state ^= self.state >> 12;
+        self.state ^= self.state << 25;
+        self.state ^= self.state >> 27;
+        (self.state.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    fn normal(&mut self) -> f64 {
+        let r = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
+        r * (core::f64::consts::TAU * self.uniform()).cos()
+    }
+}
+
+/// Blurs a square picture with nothing beyond its border by a Gaussian.
+fn blur(light: &mut [f32], side: usize, sd_px: f64) {
+    let reach = (3.0 * sd_px).ceil() as usize;
+    let weight = |d: usize| (-0.5 * (d as f64 / sd_px).powi(2)).exp() as f32;
+    let sum: f32 = (1..=reach).map(|d| 2.0 * weight(d)).sum::<f32>() + 1.0;
+    let mut line = vec![0.0_f32; side];
+    for (along, across) in [(1, side), (side, 1)] {
+        for k in 0..side {
+            for (n, v) in line.iter_mut().enumerate() {
+                *v = light[k * across + n * along];
+            }
+            for n in 0..side {
+                let near = n.saturating_sub(reach)..(n + reach + 1).min(side);
+                let mean: f32 = near.map(|m| weight(m.abs_diff(n)) * line[m]).sum();
+                light[k * across + n * along] = mean / sum;
+            }
+        }
+    }
+}
