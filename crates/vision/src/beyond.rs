@@ -19,7 +19,7 @@ const LEAST_SLOPE: f64 = 2.5;
 const LEAST_SIZE: f64 = 3.0;
 /// Largest size that another focus makes of a bead, and its inverse the smallest. Farther off the rest of the picture has
 /// changed, too, and beads of other sizes are others.
-const MOST_SIZE: f64 = 1.25;
+const MOST_SIZE: f64 = 1.5;
 /// Share of what a fit leaves beyond noise that the parameters must explain: where something else is wrong they bend to it.
 const LEAST_EXPLAINED: f64 = 0.3;
 /// Steps of the fit, and when it is at rest: place in px, size as a fraction.
@@ -306,7 +306,7 @@ impl Sums {
 }
 
 /// The fit of all parameters, from one of place, contrast and level on. Leaves the window without the slope and the template at
-/// the size found; `None` where the window does not tell the parameters apart, or they explain too little: then both are as
+/// the size found, and gives the slope; `None` where the window does not tell the parameters apart, or they explain too little: then both are as
 /// before. `start` is the place, and how much of the sum of squares is more than noise.
 pub(crate) fn fit(
     crop: &mut Crop,
@@ -315,7 +315,7 @@ pub(crate) fn fit(
     start: ((f64, f64), f64),
     weights: Weights,
     asked: Asked,
-) -> Option<(f64, f64, Pass)> {
+) -> Option<(f64, f64, Pass, (f64, f64))> {
     let (at, misfit) = start;
     let before = pass(crop, template, comb, at, weights, NONE)?.0.chi2;
     let size_before = template.size();
@@ -354,7 +354,7 @@ pub(crate) fn fit(
         crop.take_off_slope(middle(crop), (-taken.0 as f32, -taken.1 as f32));
         template.stretch_to(size_before);
     }
-    found
+    found.map(|(x_px, y_px, pass)| (x_px, y_px, pass, taken))
 }
 
 /// One pass in all parameters: step and figures, change of the slopes, relative change of the size.

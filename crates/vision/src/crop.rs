@@ -86,6 +86,11 @@ impl Crop {
         true
     }
 
+    /// Pixels of a row, rounded up to whole lanes.
+    pub(crate) fn lanes_end(&self) -> usize {
+        self.width.next_multiple_of(LANES).min(STRIDE)
+    }
+
     /// Columns of a row that are left out.
     pub(crate) fn left_out(&self, row: usize) -> impl Iterator<Item = usize> {
         let holes = self.holes.iter().take(self.holes_used);

@@ -95,16 +95,9 @@ impl ManyTracker {
         self.refused.clear();
         self.detector.detect(frame);
         let mut fixes: Vec<Fix> = Vec::new();
-        for blob in self.detector.found().iter().take(self.config.max_beads) {
-            let fix = self.localiser.locate(frame, Some((blob.x_px, blob.y_px)));
-            let apart_px = self.localiser.template().radius_px();
-            let doubled = fixes
-                .iter()
-                .any(|f| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) < apart_px);
-            if !doubled {
-                fixes.push(fix);
-            }
-        }
+        let found = self.detector.found().iter().take(self.config.max_beads);
+        let places = found.map(|blob| (blob.x_px, blob.y_px));
+        self.localiser.locate_all(frame, places, &mut fixes);
         let mut pairs: Vec<(f64, usize, usize)> = Vec::new();
         for (t, track) in self.tracks.iter().enumerate() {
             for (f, fix) in fixes.iter().enumerate() {

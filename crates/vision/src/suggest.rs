@@ -216,7 +216,7 @@ fn learn(
     let rough = LocaliserConfig::new(config.profile);
     config.template_tolerance =
         (TOLERANCE_MARGIN * needed).clamp(rough.template_tolerance, MOST_TOLERANCE);
-    config.min_snr = (ROOM_FOR_NOISE * snr).clamp(3.0, 20.0);
+    config.min_snr = (ROOM_FOR_NOISE * snr).clamp(1.0, 20.0);
     let max_step_px = step_px(&fits, reach_px);
     let range = Range::of(&config, snr);
     Ok(Suggestion {

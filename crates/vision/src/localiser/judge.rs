@@ -38,6 +38,8 @@ impl Localiser {
             Weights::Shot { base, .. } => f64::from(base),
         };
         let snr = self.sign * amplitude / variance.sqrt();
+        // Whether the light that rises is that which the bead is seen by, nobody says.
+        let shaded = |slope: f64| (self.shading_px2 * slope / background.max(1.0)).powi(2);
         let in_window =
             |c: f64, first: usize, len: usize| c >= first as f64 && c <= (first + len - 1) as f64;
         let kept = in_window(f.x_px, self.crop.x0, self.crop.width)
@@ -54,8 +56,8 @@ impl Localiser {
         Fix {
             x_px: f.x_px,
             y_px: f.y_px,
-            var_x_px2: unit * f.pass.covariance[(0, 0)],
-            var_y_px2: unit * f.pass.covariance[(1, 1)],
+            var_x_px2: unit * f.pass.covariance[(0, 0)] + shaded(f.slope.0),
+            var_y_px2: unit * f.pass.covariance[(1, 1)] + shaded(f.slope.1),
             cov_xy_px2: unit * f.pass.covariance[(0, 1)],
             amplitude,
             background,
@@ -200,6 +202,21 @@ pub(super) fn filled(template: &Template, window_px: usize) -> [f64; 2] {
         }
         ((square / n - sum * sum / (n * n)) / MEASURED).min(1.0)
     })
+}
+
+/// Way that a fit goes if the bead's image is multiplied by light that rises by all of itself over a px: the square of the standard
+/// deviation for a Gaussian.
+pub(super) fn shading_px2(template: &Template, window_px: usize) -> f64 {
+    let half = (window_px / 2) as i32;
+    let (mut moved, mut place) = (0.0, 0.0);
+    for (y, x) in (-half..=half).flat_map(|y| (-half..=half).map(move |x| (y, x))) {
+        let (f, by_square) = template.at((x * x + y * y) as f32);
+        let (x, f) = (f64::from(x), f64::from(f));
+        let by_x = -2.0 * x * f64::from(by_square * template.slope_factor());
+        moved += f * x * by_x;
+        place += by_x * by_x;
+    }
+    if place > 0.0 { moved / place } else { 0.0 }
 }
 
 #[cfg(test)]

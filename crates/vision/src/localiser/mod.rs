@@ -1,5 +1,6 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
+mod among;
 mod certainty;
 mod judge;
 mod noise;
@@ -21,6 +22,7 @@ use crate::seed;
 use crate::speckle;
 use crate::streak::Comb;
 use crate::template::Template;
+use among::Others;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
 const CONVERGED_PX: f64 = 0.01;
@@ -61,6 +63,11 @@ pub struct Localiser {
     /// Whether a residual that is the same all round counts as none, and how much of what may be lopsided was in the last one asked.
     pardons: bool,
     lopsided: f64,
+    /// Beads whose images are taken off the windows of this fix, and whether this fix is one of those on the way to a better one.
+    others: Others,
+    drafts: bool,
+    /// What light that falls unevenly on the bead moves it by: see [`judge::shading_px2`].
+    shading_px2: f64,
     /// How much of a window the bead fills: the whole window, and the narrow one.
     filled: [f64; 2],
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
@@ -77,6 +84,8 @@ struct Fitted {
     y_px: f64,
     pass: Pass,
     converged: bool,
+    /// Rise of the light along the row and along the column, where it was fitted, grey levels a px.
+    slope: (f64, f64),
     /// What it leaves, where that was looked at.
     left: Left,
 }
@@ -93,6 +102,7 @@ impl Localiser {
             .learning
             .map(|l| Learner::new(l, config.window_px, &template));
         let filled = judge::filled(&template, config.window_px);
+        let shading_px2 = judge::shading_px2(&template, config.window_px);
         Ok(Localiser {
             config,
             template,
@@ -106,6 +116,9 @@ impl Localiser {
             cleans: false,
             pardons: false,
             lopsided: 0.0,
+            others: Others::default(),
+            drafts: false,
+            shading_px2,
             filled,
             local: Pool::default(),
             lines: [Pool::default(); 2],
@@ -167,7 +180,7 @@ impl Localiser {
         };
         let window_px = self.config.window_px;
         let fix = self.attempt(frame, (x_px, y_px), window_px);
-        if fix.verdict == FixQuality::Good {
+        if fix.verdict == FixQuality::Good && !self.drafts {
             self.learn(&fix);
         }
         if matches!(fix.verdict, FixQuality::Good | FixQuality::AtBorder) {
@@ -191,7 +204,7 @@ impl Localiser {
             }
         }
         // The guess may have been out of the fit's reach: once more from the centroid.
-        if !self.crop.take(frame, x_px, y_px, window_px) {
+        if !self.take_crop(frame, x_px, y_px, window_px) {
             return fix;
         }
         let Some(centroid) = self.crop.centroid(self.sign as f32, radius_px) else {
@@ -220,7 +233,7 @@ impl Localiser {
 
     /// Copies a window.
     fn take_window(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> bool {
-        let taken = self.crop.take(frame, x_px, y_px, side_px);
+        let taken = self.take_crop(frame, x_px, y_px, side_px);
         if taken
             && self.cleans
             && let Some(variance) = self.noise_variance
@@ -253,6 +266,9 @@ impl Localiser {
         let mut fix = self.judge(frame, fitted, (x_px, y_px));
         if fix.verdict == FixQuality::BadFit && self.pardons {
             self.pardon(frame, &mut fix);
+        }
+        if self.drafts {
+            return fix;
         }
         let widening = self.widen(&mut fix, &left);
         if fix.verdict == FixQuality::Good
@@ -324,6 +340,7 @@ impl Localiser {
         if learner.take_in(&self.crop, (fix.x_px, fix.y_px), fix.amplitude, background) {
             learner.refresh(&mut self.template);
             self.filled = judge::filled(&self.template, self.config.window_px);
+            self.shading_px2 = judge::shading_px2(&self.template, self.config.window_px);
         }
     }
 
@@ -381,6 +398,7 @@ impl Localiser {
                         pass,
                         converged: false,
                         left: Left::default(),
+                        slope: (0.0, 0.0),
                     });
                 }
                 recentres += 1;
@@ -395,6 +413,7 @@ impl Localiser {
                     pass,
                     converged: true,
                     left: Left::default(),
+                    slope: (0.0, 0.0),
                 });
             }
         }
@@ -404,6 +423,7 @@ impl Localiser {
             pass,
             converged: false,
             left: Left::default(),
+            slope: (0.0, 0.0),
         })
     }
 }

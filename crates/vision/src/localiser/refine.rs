@@ -89,13 +89,14 @@ impl Localiser {
             weights,
             asked,
         );
-        let Some((x_px, y_px, pass)) = found else {
+        let Some((x_px, y_px, pass, slope)) = found else {
             return Some(f);
         };
         let found = Fitted {
             x_px,
             y_px,
             pass,
+            slope,
             ..f
         };
         Some(Fitted {

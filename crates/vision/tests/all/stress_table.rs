@@ -83,14 +83,9 @@ fn measured(localiser: &mut Localiser, scene: &Scene, random: &mut Random, beads
         let picture = scene.picture(random);
         let frame = picture.frame();
         let mut found: Vec<Fix> = Vec::new();
-        for seed in detector.detect(&frame).to_vec() {
-            let fix = localiser.locate(&frame, Some((seed.x_px, seed.y_px)));
-            let apart = localiser.template().radius_px();
-            let new = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) >= apart;
-            if fix.verdict == FixQuality::Good && found.iter().all(new) {
-                found.push(fix);
-            }
-        }
+        let places = detector.detect(&frame).iter().map(|b| (b.x_px, b.y_px));
+        localiser.locate_all(&frame, places, &mut found);
+        found.retain(|fix| fix.verdict == FixQuality::Good);
         score.add(&picture, &found, scene.profile.radius_px());
     }
     score

@@ -1,0 +1,141 @@
+//! All beads of a frame: each is fitted in a window from which the images of its neighbours are taken off.
+//!
+//! Taking off what was fitted and fitting again converges to the fit of all beads together, at the price of single fits.
+
+use super::Localiser;
+use crate::fit::Image;
+use crate::fix::{Fix, FixQuality};
+use crate::frame::Frame;
+use crate::streak::Comb;
+use crate::template::Template;
+
+/// Most neighbours whose images are taken off a window.
+const MOST_OTHERS: usize = 8;
+/// Share of a bead's contrast below which there is nothing left of its image.
+const FADED: f32 = 0.03;
+/// Rounds in which fits and images taken off improve each other; the last one counts. The error falls by the overlap each time.
+const ROUNDS: usize = 3;
+
+/// The beads taken off the windows of a fix: place in the frame, px, and contrast, grey levels.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Others {
+    beads: [(f64, f64, f64); MOST_OTHERS],
+    count: usize,
+}
+
+impl Others {
+    fn add(&mut self, fix: &Fix) {
+        if let Some(free) = self.beads.get_mut(self.count) {
+            *free = (fix.x_px, fix.y_px, fix.amplitude);
+            self.count += 1;
+        }
+    }
+}
+
+impl Localiser {
+    /// Positions of all beads near the places given (px), into `fixes`: one a bead, of any verdict. Beads whose images overlap are
+    /// fitted beside each other.
+    pub fn locate_all(
+        &mut self,
+        frame: &Frame,
+        places: impl Iterator<Item = (f64, f64)> + Clone,
+        fixes: &mut Vec<Fix>,
+    ) {
+        fixes.clear();
+        let radius_px = self.template.radius_px();
+        let reach_px = 2.0 * extent_px(&self.template);
+        for (n, (x, y)) in places.clone().enumerate() {
+            let alone = places
+                .clone()
+                .enumerate()
+                .all(|(m, (u, v))| m == n || f64::hypot(u - x, v - y) > reach_px);
+            self.drafts = !alone;
+            let fix = self.locate(frame, Some((x, y)));
+            self.drafts = false;
+            let apart = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) >= radius_px;
+            if fixes.iter().all(apart) {
+                fixes.push(fix);
+            }
+        }
+        for round in 1..=ROUNDS {
+            for k in 0..fixes.len() {
+                let own = fixes[k];
+                let near = |f: &Fix| {
+                    let off_px = f64::hypot(f.x_px - own.x_px, f.y_px - own.y_px);
+                    off_px > 0.0 && off_px <= reach_px
+                };
+                let is_bead = |f: &&Fix| {
+                    matches!(f.verdict, FixQuality::Good | FixQuality::BadFit)
+                        && self.sign * f.amplitude > 0.0
+                };
+                // Without a neighbour it has been located for good.
+                if !fixes.iter().any(near) {
+                    continue;
+                }
+                let mut others = Others::default();
+                fixes
+                    .iter()
+                    .filter(is_bead)
+                    .filter(|f| near(f))
+                    .for_each(|f| others.add(f));
+                self.others = others;
+                self.drafts = round < ROUNDS;
+                let fix = self.locate(frame, Some((own.x_px, own.y_px)));
+                self.others = Others::default();
+                self.drafts = false;
+                let off_px = f64::hypot(fix.x_px - own.x_px, fix.y_px - own.y_px);
+                if off_px < radius_px || round == ROUNDS {
+                    fixes[k] = fix;
+                }
+            }
+        }
+        let mut kept = 0;
+        for k in 0..fixes.len() {
+            let fix = fixes[k];
+            let same = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) < radius_px;
+            if !fixes[..kept].iter().any(same) {
+                fixes[kept] = fix;
+                kept += 1;
+            }
+        }
+        fixes.truncate(kept);
+    }
+
+    /// Copies a window, without the neighbours' images.
+    pub(super) fn take_crop(
+        &mut self,
+        frame: &Frame,
+        x_px: f64,
+        y_px: f64,
+        side_px: usize,
+    ) -> bool {
+        if !self.crop.take(frame, x_px, y_px, side_px) {
+            return false;
+        }
+        for (x_px, y_px, contrast) in self.others.beads.iter().take(self.others.count) {
+            let lanes_end = self.crop.lanes_end();
+            let mut image = Image::new(lanes_end);
+            let x = (x_px - self.crop.x0 as f64) as f32;
+            let y = (y_px - self.crop.y0 as f64) as f32;
+            let height = self.crop.height;
+            for (j, row) in self.crop.rows.iter_mut().enumerate().take(height) {
+                image.draw_row(&self.template, &Comb::STILL, x, j as f32 - y);
+                for (v, f) in row.iter_mut().zip(&image.value).take(lanes_end) {
+                    *v -= *contrast as f32 * f;
+                }
+            }
+        }
+        true
+    }
+}
+
+/// Distance from its centre beyond which there is nothing left of a bead's image, px.
+fn extent_px(template: &Template) -> f64 {
+    let steps = 64;
+    let step_px = template.support_px() / f64::from(steps);
+    let shows = |k: &i32| {
+        let r_px = f64::from(*k) * step_px;
+        template.value_at_squared((r_px * r_px) as f32).abs() > FADED
+    };
+    f64::from((0..steps).rev().find(shows).unwrap_or(steps) + 1) * step_px
+}
