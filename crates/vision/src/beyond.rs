@@ -19,7 +19,7 @@ const LEAST_SLOPE: f64 = 2.5;
 const LEAST_SIZE: f64 = 3.0;
 /// Largest size that another focus makes of a bead, and its inverse the smallest. Farther off the rest of the picture has
 /// changed, too, and beads of other sizes are others.
-const MOST_SIZE: f64 = 1.5;
+const MOST_SIZE: f64 = 1.25;
 /// Share of what a fit leaves beyond noise that the parameters must explain: where something else is wrong they bend to it.
 const LEAST_EXPLAINED: f64 = 0.3;
 /// Steps of the fit, and when it is at rest: place in px, size as a fraction.

@@ -6,7 +6,7 @@
 use super::background::{Background, SAMPLES};
 
 /// Largest shift that is made good, px.
-const MOST_PX: f64 = 3.0;
+pub(super) const MOST_PX: f64 = 3.5;
 /// Shifts below this are none, px; and below so many standard deviations.
 const LEAST: (f64, f64) = (0.03, 4.0);
 /// Frames after which these are chosen anew.
@@ -110,17 +110,6 @@ impl Sums {
             limit: (8.0 * spread).max(4.0 * noise),
         })
     }
-}
-
-/// Weights of four pixels in a row for a place between the middle two, by a cubic through them (Catmull-Rom).
-fn cubic(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [
-        0.5 * (-t3 + 2.0 * t2 - t),
-        0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
-        0.5 * (-3.0 * t3 + 4.0 * t2 + t),
-        0.5 * (t3 - t2),
-    ]
 }
 
 impl Background {
@@ -303,44 +292,5 @@ impl Background {
             }
         }
         sums
-    }
-
-    /// What a frame shifted by `shift` px differs by from the background at `light`, into `contrast`.
-    pub(super) fn contrast_shifted<T: Copy>(
-        &self,
-        pixels: &[T],
-        light: f32,
-        shift: (f64, f64),
-        (contrast, row): (&mut [f32], &mut [f32]),
-    ) where
-        f32: From<T>,
-    {
-        let (width, height) = (self.width, self.height());
-        let split = |d: f64| {
-            let whole = (-d).floor();
-            (whole as isize, cubic((-d - whole) as f32))
-        };
-        let ((ox, wx), (oy, wy)) = (split(shift.0), split(shift.1));
-        let inside = |k: isize, len: usize| k.clamp(0, len as isize - 1) as usize;
-        let rows = contrast
-            .chunks_exact_mut(width)
-            .zip(pixels.chunks_exact(width));
-        for (y, (out, frame)) in rows.enumerate() {
-            row.fill(0.0);
-            for (n, w) in (-1..).zip(wy) {
-                let from = inside(y as isize + oy + n, height) * width;
-                let means = self.mean.get(from..from + width).unwrap_or(&[]);
-                for (sum, m) in row.iter_mut().zip(means) {
-                    *sum += w * m;
-                }
-            }
-            for (x, (c, p)) in out.iter_mut().zip(frame).enumerate() {
-                let mut m = 0.0;
-                for (n, w) in (-1..).zip(wx) {
-                    m += w * row[inside(x as isize + ox + n, width)];
-                }
-                *c = f32::from(*p) - light * m;
-            }
-        }
     }
 }

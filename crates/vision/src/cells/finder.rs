@@ -1,7 +1,9 @@
 //! The finder: background, regions, outlines.
 
 use super::background::Background;
+use super::focus::{Last, Moved};
 use super::regions::{Part, Regions, is_object};
+use super::softer::{MOST_REACH, Softer};
 use super::{Cell, CellConfig, CellError};
 use crate::blobs::Blob;
 use crate::config::ConfigError;
@@ -19,7 +21,7 @@ const DENT: f64 = 0.15;
 const DENT_SIGMA: f64 = 3.0;
 /// Width of a halo that belongs to the cell, px and share of the short half axis.
 const HALO: (f64, f64) = (6.0, 0.35);
-/// Largest shift of a frame that the background follows, px.
+/// Largest shift and blur of a frame that the background follows, px.
 const MOST_REFRESHED_PX: f64 = 0.5;
 /// Cells of a frame whose outlines are kept.
 const KEPT_OUTLINES: usize = 8;
@@ -48,9 +50,11 @@ pub struct CellFinder {
     dust: u32,
     /// Light of the last frame relative to the background's.
     light: f32,
-    /// Shift of the last frame against the background, px.
-    drift_px: (f64, f64),
-    /// A row of the shifted background.
+    /// How the last frame differs from the background.
+    moved: Moved,
+    last: Last,
+    softer: Softer,
+    /// A row of the moved background, and what lies beyond it.
     row: Vec<f32>,
 }
 
@@ -110,8 +114,10 @@ impl CellFinder {
                 .collect(),
             dust: 0,
             light: 1.0,
-            drift_px: (0.0, 0.0),
-            row: vec![0.0; width],
+            moved: Moved::default(),
+            last: Last::none(),
+            softer: Softer::new(width * height),
+            row: vec![0.0; width + 2 * MOST_REACH],
         })
     }
 
@@ -225,7 +231,13 @@ impl CellFinder {
     /// Shift of the last frame against the background, px to the right and down, for which it was made good; noughts where
     /// there was none to speak of.
     pub fn drift_px(&self) -> (f64, f64) {
-        self.drift_px
+        self.moved.shift_px
+    }
+
+    /// How much softer the last frame is than the background, px: the standard deviation of the Gaussian that the background was
+    /// blurred by before it was taken off; 0 for a frame in the background's focus.
+    pub fn blur_px(&self) -> f64 {
+        self.moved.blur_px
     }
 
     /// Regions of the last frame that stood out but have no outline, or one smaller than a cell.
@@ -253,7 +265,8 @@ impl CellFinder {
     pub fn refresh(&mut self, frame: &Frame) {
         // In quite another light it is not the background that has changed.
         let frames = self.config.refresh_frames;
-        let moved = f64::hypot(self.drift_px.0, self.drift_px.1) > MOST_REFRESHED_PX;
+        let (x_px, y_px) = self.moved.shift_px;
+        let moved = f64::hypot(x_px, y_px).max(self.moved.blur_px) > MOST_REFRESHED_PX;
         if frames == 0 || moved || self.is_cluttered() || !(0.8..1.25).contains(&self.light) {
             return;
         }
@@ -287,8 +300,11 @@ impl CellFinder {
         let light = self.background.light_of(pixels);
         self.light = light;
         self.background.choose_steep();
-        self.drift_px = self.background.drift_of(pixels, light);
-        if self.drift_px == (0.0, 0.0) {
+        self.softer.follow(&self.background, &mut self.row);
+        let softer = &self.softer;
+        self.moved = self.background.moved(softer, pixels, light, &mut self.last);
+        self.outliner.expect_blur(self.moved.blur_px);
+        if self.moved.is_none() {
             let means = pixels.iter().zip(&self.background.mean);
             for (c, (p, m)) in self.contrast.iter_mut().zip(means) {
                 *c = f32::from(*p) - light * m;
@@ -296,7 +312,7 @@ impl CellFinder {
         } else {
             let buffers = (self.contrast.as_mut_slice(), self.row.as_mut_slice());
             self.background
-                .contrast_shifted(pixels, light, self.drift_px, buffers);
+                .contrast_moved(pixels, light, self.moved, buffers);
         }
         self.background.calm(&mut self.contrast);
         let noise = self.noise_grey();

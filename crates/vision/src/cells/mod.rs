@@ -7,7 +7,9 @@
 mod background;
 mod drift;
 mod finder;
+mod focus;
 mod regions;
+mod softer;
 
 use serde::{Deserialize, Serialize};
 

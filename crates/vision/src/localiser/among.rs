@@ -13,6 +13,8 @@ use crate::template::Template;
 const MOST_OTHERS: usize = 8;
 /// Share of a bead's contrast below which there is nothing left of its image.
 const FADED: f32 = 0.03;
+/// Share of a bead's contrast below which a bad fit beside it is no bead.
+const LEAST_SHARE: f64 = 0.3;
 /// Rounds in which fits and images taken off improve each other; the last one counts. The error falls by the overlap each time.
 const ROUNDS: usize = 3;
 
@@ -64,9 +66,11 @@ impl Localiser {
                     let off_px = f64::hypot(f.x_px - own.x_px, f.y_px - own.y_px);
                     off_px > 0.0 && off_px <= reach_px
                 };
+                // Two beads may be a bad fit because of each other; what is much weaker is none.
                 let is_bead = |f: &&Fix| {
-                    matches!(f.verdict, FixQuality::Good | FixQuality::BadFit)
-                        && self.sign * f.amplitude > 0.0
+                    f.verdict == FixQuality::Good
+                        || f.verdict == FixQuality::BadFit
+                            && f.amplitude / own.amplitude > LEAST_SHARE
                 };
                 // Without a neighbour it has been located for good.
                 if !fixes.iter().any(near) {

@@ -173,8 +173,12 @@ impl Localiser {
             self.pixel_variance(fix.background),
         );
         let mut widening = widening.unwrap_or(fix.residual_ratio).max(1.0);
-        if self.template.radius_px() < UNRESOLVED_PX {
-            widening = widening.max(left.local_variance / self.pixel_variance(fix.background));
+        let radius_px = self.template.radius_px();
+        if radius_px < UNRESOLVED_PX {
+            // Four parameters take their part of the few pixels that tell the place.
+            let pixels = (core::f64::consts::PI * radius_px * radius_px).max(8.0);
+            let left = left.local_variance * pixels / (pixels - 4.0);
+            widening = widening.max(left / self.pixel_variance(fix.background));
         }
         fix.var_x_px2 *= widening;
         fix.var_y_px2 *= widening;

@@ -109,8 +109,9 @@ impl Outliner {
             }
         }
         let hull_area = self.hull_area();
-        // What the smear of a round edge leaves to all points alike.
-        let left_px = self.smear.left_px((area_px / core::f64::consts::PI).sqrt());
+        // What smear and blur leave to all points alike.
+        let smeared_px = self.smear.left_px((area_px / core::f64::consts::PI).sqrt());
+        let left_px = f64::hypot(smeared_px, self.blur_left_px);
         area_variance += (left_px * around[0]).powi(2);
         let pairs = [(1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3)];
         for (sum, (i, j)) in c.iter_mut().zip(pairs) {
