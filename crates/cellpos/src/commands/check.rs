@@ -38,7 +38,7 @@ pub(crate) struct Args {
     #[arg(long)]
     slew: Option<MicrometersPerSecond>,
     /// Field of view along the channel: positions from minus this to plus this are in view.
-    #[arg(long)]
+    #[arg(long = "field", alias = "view")]
     view: Option<Micrometers>,
     /// Write reference and PZT demand as a report.
     #[arg(long)]
@@ -66,7 +66,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         print_text(&text(&script, &result))?;
         if !knows_view {
             print_text(&format!(
-                "field of view: assumed from -{0} to {0} um; give yours with --view (`cellpos run` asks the camera)\n",
+                "field of view: assumed from -{0} to {0} um; give yours with --field (`cellpos run` asks the camera)\n",
                 limits.view_um
             ))?;
         }
