@@ -44,6 +44,7 @@ impl Localiser {
         fixes: &mut Vec<Fix>,
     ) {
         fixes.clear();
+        let mut drafted = Vec::new();
         let radius_px = self.template.radius_px();
         let reach_px = 2.0 * extent_px(&self.template);
         for (n, (x, y)) in places.clone().enumerate() {
@@ -57,6 +58,7 @@ impl Localiser {
             let apart = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) >= radius_px;
             if fixes.iter().all(apart) {
                 fixes.push(fix);
+                drafted.push(!alone);
             }
         }
         for round in 1..=ROUNDS {
@@ -72,8 +74,7 @@ impl Localiser {
                         || f.verdict == FixQuality::BadFit
                             && f.amplitude / own.amplitude > LEAST_SHARE
                 };
-                // Without a neighbour it has been located for good.
-                if !fixes.iter().any(near) {
+                if !drafted[k] {
                     continue;
                 }
                 let mut others = Others::default();
