@@ -137,6 +137,9 @@ fn level(kind: &EventKind) -> Level {
     }
 }
 
+const NEAR_LIMIT: &str = "The bead is nearly too faint, too blurred or too far out of focus for the settings of vision: mend light or \
+                          focus before it is lost.";
+
 fn text(kind: &EventKind) -> String {
     match *kind {
         EventKind::Armed => "The board is armed; the bead is being looked for.".to_string(),
@@ -186,9 +189,7 @@ fn text(kind: &EventKind) -> String {
         } => format!("Vision takes {vision_ms:.2} ms for a frame of {period_ms:.2} ms."),
         EventKind::VisionSlowEnded { lasted_ms } => ended("Vision keeps up again", lasted_ms),
         EventKind::CameraRestarted => "The camera restarted its frame numbers.".to_string(),
-        EventKind::NearLimit => "The bead is nearly too faint, too blurred or too far out of focus for the settings of vision: mend \
-             light or focus before it is lost."
-            .to_string(),
+        EventKind::NearLimit => NEAR_LIMIT.to_string(),
         EventKind::BeadReacquired { position_um } => {
             format!("The bead was lost; the one found at {position_um:.3} um may be another.")
         }
