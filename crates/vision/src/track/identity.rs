@@ -17,6 +17,8 @@ pub(crate) struct Identity {
     fixes: f64,
     /// Fixes since the size was measured last.
     unmeasured: f64,
+    /// Amplitude, residual and size of the last fix.
+    last: (f64, f64, Option<f64>),
 }
 
 impl Identity {
@@ -27,6 +29,7 @@ impl Identity {
             size: size.map(|s| s.0),
             fixes: 1.0,
             unmeasured: 0.0,
+            last: (fix.amplitude, fix.residual_ratio, size.map(|s| s.0)),
         }
     }
 
@@ -51,20 +54,25 @@ impl Identity {
         fix: &Fix,
         size: Option<(f64, f64)>,
     ) -> f64 {
-        let amplitude = (fix.amplitude / self.amplitude - 1.0).abs() / config.max_amplitude_change;
-        let residual = fix.residual_ratio / (config.max_residual_growth * self.residual.max(1.0));
-        let size = match (self.size, size) {
-            (Some(own), Some((other, sd))) => {
-                (other / own - 1.0).abs() / (config.max_size_change + SIZE_SIGMA * sd)
-            }
-            _ => 0.0,
-        };
-        amplitude.max(residual).max(size)
+        let own = (self.amplitude, self.residual, self.size);
+        change(own, config, fix, size)
+    }
+
+    /// Whether a fix looks as the last one did: a bead that swims over dust changes from frame to frame, and by much in all.
+    pub(super) fn goes_on(
+        &self,
+        config: &TrackerConfig,
+        fix: &Fix,
+        size: Option<(f64, f64)>,
+    ) -> bool {
+        change(self.last, config, fix, size) <= 1.0
     }
 
     /// Follows slow changes of light and focus.
     pub(super) fn update(&mut self, fix: &Fix, size: Option<(f64, f64)>) {
         self.fixes += 1.0;
+        let own_size = size.map(|s| s.0).or(self.last.2);
+        self.last = (fix.amplitude, fix.residual_ratio, own_size);
         let share = FORGETTING.max(1.0 / self.fixes);
         self.amplitude += share * (fix.amplitude - self.amplitude);
         self.residual += share * (fix.residual_ratio - self.residual);
@@ -76,4 +84,22 @@ impl Identity {
             self.unmeasured = 0.0;
         }
     }
+}
+
+/// The share of the changes that are allowed by which a fix differs from this amplitude, residual and size.
+fn change(
+    (amplitude, residual, own_size): (f64, f64, Option<f64>),
+    config: &TrackerConfig,
+    fix: &Fix,
+    size: Option<(f64, f64)>,
+) -> f64 {
+    let amplitude = (fix.amplitude / amplitude - 1.0).abs() / config.max_amplitude_change;
+    let residual = fix.residual_ratio / (config.max_residual_growth * residual.max(1.0));
+    let size = match (own_size, size) {
+        (Some(own), Some((other, sd))) => {
+            (other / own - 1.0).abs() / (config.max_size_change + SIZE_SIGMA * sd)
+        }
+        _ => 0.0,
+    };
+    amplitude.max(residual).max(size)
 }

@@ -286,6 +286,7 @@ impl Tracker {
         self.fit_as_carried(frame, &chosen);
         self.part_touching_beads(frame, &chosen);
 
+        let alone = self.is_alone();
         let (mut best, mut nearest) = (None::<usize>, None::<Fix>);
         let mut misfit = None;
         for (k, c) in self.candidates.iter().enumerate() {
@@ -302,8 +303,7 @@ impl Tracker {
                     Decision::OtherBead
                 });
             }
-            let mut ok = c.fix.verdict == FixQuality::Good
-                && chosen.identity.agrees(&self.config, &c.fix, c.size);
+            let mut ok = c.fix.verdict == FixQuality::Good && self.looks_like(&chosen, c, alone);
             // A lost bead may come back anywhere; a coasting one where the flow can have carried it.
             ok &= self.standing.state == TrackState::Lost
                 || self.within_reach(&chosen.motion, &c.fix);
@@ -368,6 +368,23 @@ impl Tracker {
             (None, Some(_)) => (Decision::Ambiguous, nearest),
             (None, None) => (misfit.unwrap_or(Decision::NothingFound), nearest),
         }
+    }
+
+    /// Whether the bead was seen in the frame before, and no other one is in the picture.
+    fn is_alone(&self) -> bool {
+        let good = |c: &&Candidate| c.fix.verdict == FixQuality::Good;
+        self.standing.state == TrackState::Tracking
+            && self.neighbours.count() == 0
+            && self.candidates.iter().flatten().filter(good).count() == 1
+    }
+
+    /// Whether a candidate looks like the bead. One that is alone, where it was a frame ago, and looks as it did then, is ours,
+    /// whatever it swims over.
+    fn looks_like(&self, chosen: &Chosen, c: &Candidate, alone: bool) -> bool {
+        let goes_on = alone
+            && self.within_gate(&chosen.motion, &c.fix)
+            && chosen.identity.goes_on(&self.config, &c.fix, c.size);
+        goes_on || chosen.identity.agrees(&self.config, &c.fix, c.size)
     }
 
     fn take(&mut self, mut chosen: Chosen, c: &Candidate, time_s: f64) {
