@@ -377,3 +377,39 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits, args: &Args) -> 
     report.command(&crate::output::command_line());
     report
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_script::LimitUse;
+
+    /// No factor is promised that would break the limit.
+    #[test]
+    fn a_factor_is_rounded_down() {
+        assert_eq!(short(6.259), "6.2");
+        assert_eq!(short(0.999), "0.99");
+        assert_eq!(short(111.9), "111");
+    }
+
+    #[test]
+    fn the_sentence_names_the_limit_that_binds() {
+        let text = "[[step]]\ndo = \"move\"\nto = \"8um\"\nduration = \"200ms\"\n";
+        let script = Script::parse(text, "s.toml").unwrap();
+        let limits = CheckLimits::default();
+        let mut found = check(&script, &Model::eq6(), &limits).unwrap();
+        let (_, text) = sentence(&found, &limits);
+        assert!(
+            text.contains("field of view, 50 um to each side, of which it uses 16 %"),
+            "{text}"
+        );
+        found.used.push(LimitUse {
+            what: "PZT slew",
+            share: 0.5,
+        });
+        let (_, text) = sentence(&found, &limits);
+        assert!(
+            text.contains("speed of the piezo (PZT), 10000 um/s, of which it uses 50 %"),
+            "{text}"
+        );
+    }
+}

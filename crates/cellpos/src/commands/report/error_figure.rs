@@ -125,3 +125,32 @@ fn amplitudes(reached: &[(f64, Vec<f64>)]) -> Panel {
         .series(Series::intervals("reached", &at, &means, &of(-1.0), &of(1.0)).color(0))
         .horizontal(100.0, "")
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_script::ArmKind;
+
+    #[test]
+    fn cycles_of_one_amplitude_are_one_motion() {
+        let rows: Vec<CycleRow> = (0..12)
+            .map(|cycle| {
+                let mut row = CycleRow::empty(cycle, 1, ArmKind::Cyclic);
+                (row.stroke_um, row.duration_s) = ([4.0, 0.5, 2.0][cycle as usize % 3], 0.25);
+                row.start_s = cycle as f64;
+                // The fundamental of a wave is fitted to its ticks, and scatters.
+                row.commanded_um = 0.81 * row.stroke_um * (1.0 + 1e-3 * (cycle % 2) as f64);
+                (row.reached_um, row.bias_um) = (0.9 * row.commanded_um, 0.0);
+                row
+            })
+            .collect();
+        let found = motions(&rows);
+        let amplitudes: Vec<f64> = found.iter().map(|(um, _)| *um).collect();
+        assert_eq!(amplitudes, [0.5, 2.0, 4.0]);
+        assert!(
+            found
+                .iter()
+                .all(|(_, reached)| reached.len() == 4 && (mean(reached) - 0.9).abs() < 1e-9)
+        );
+    }
+}
