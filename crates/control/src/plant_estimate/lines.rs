@@ -4,14 +4,15 @@
 //! Each line is an oscillator in the disturbance model. The residual of the fixes passes the filter of [`super::whiten`]; there an
 //! error `dz` of an oscillator is `Re(S dz)` plus white noise, with `S` the response of that filter at the line's frequency. A Kalman
 //! filter of amplitude, phase, frequency and drift of the frequency follows from that. The command cancels the line through the inverse of
-//! the model. Estimator and regression leave this part of the command out, because the disturbance cancels it. A line is
-//! accepted if its peak in a spectrum exceeds the neighbouring bins beyond chance, and removed if its amplitude is no larger than chance.
+//! the model. Estimator and regression leave this part of the command out, because the disturbance cancels it. A line is tracked if its peak
+//! in a spectrum exceeds the neighbouring bins, counts if the fixes that follow show it beyond chance, and is removed if its amplitude is
+//! no larger than chance.
 //!
 //! Amplitudes are in units of the command (bead motion over the gain in force): they stay valid when the gain in force changes.
 
 use super::whiten::Whitener;
 use cellpos_numeric::statistics::invert;
-use std::f64::consts::TAU;
+use std::f64::consts::{LN_2, TAU};
 
 /// Lines at once: a pump with five harmonics, the mains, and one more.
 const MOST: usize = 8;
@@ -31,11 +32,13 @@ const ONE_LINE: f64 = 1.5;
 /// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
 /// than half.
 const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
-/// Number of nearest bins on a side, and the ratio of a peak to their mean above which it is narrow. A tone that fills 0.4 of the window
+/// Number of nearest bins on a side, and the ratio of a peak to their mean above the background from which on it is narrow. A tone that fills 0.4 of the window
 /// reaches 20, one that fills half the window 41; in less time two tones 1 Hz apart are one peak. Later nine in ten windows separate them.
 const SKIRT: usize = 6;
 const NARROW: f64 = 34.0;
-/// Mean time between two false positives, s: 28 hours.
+/// Mean time between two false candidates, s: each adds as much to the hold error as a line, for a second. The fixes that follow confirm
+/// one of a thousand of them: mean time between two false positives, s, 28 hours.
+const CANDIDATE_S: f64 = 100.0;
 const FALSE_S: f64 = 1e5;
 /// Memory of amplitude and phase, s: a line that stops is gone in that time, and each line adds 0.3 % to the hold error.
 const MEMORY_S: f64 = 0.5;
@@ -58,8 +61,10 @@ pub(super) struct LineSettings {
     interval: f64,
     ticks: u32,
     bins: usize,
-    /// Power of a peak over the median of its background that chance exceeds once in [`FALSE_S`].
+    /// Power of a peak over the median of its background that chance exceeds once in [`CANDIDATE_S`].
     peak: f64,
+    /// Square of the amplitude of a candidate over its variance that chance exceeds in one of `FALSE_S / CANDIDATE_S`.
+    sure: f64,
 }
 
 /// One line.
@@ -73,6 +78,8 @@ struct Line {
     drift: f64,
     /// Variance of the amplitude, um^2.
     radial_um2: f64,
+    /// The fixes after the spectrum show it as well.
+    confirmed: bool,
     /// Covariance of the error across (um), the angle in a fix (rad) and its change.
     across: [[f64; 3]; 3],
 }
@@ -129,13 +136,15 @@ impl LineSettings {
         let beside = *BESIDE.end() + 1;
         let bins = (highest + beside).min(BINS).min(WINDOW / 2) / AT_ONCE * AT_ONCE;
         let spectrum_s = (bins / AT_ONCE * (WINDOW / CHUNK + 1)) as f64 * sample_s;
-        let looks = (FALSE_S / spectrum_s * bins as f64).ln();
+        let looks = (CANDIDATE_S / spectrum_s * bins as f64).ln();
         Self {
             sample_s,
             interval,
             ticks: ticks as u32,
             bins,
             peak: peak_over_median(2 * BESIDE.count(), looks),
+            // The sum of two squares of a normal distribution.
+            sure: 2.0 * (FALSE_S / CANDIDATE_S).ln(),
         }
     }
 
@@ -181,6 +190,7 @@ impl Line {
             turn,
             drift: 0.0,
             radial_um2: FIRST_UM * FIRST_UM,
+            confirmed: false,
             across,
         }
     }
@@ -263,9 +273,9 @@ impl Lines {
         }
     }
 
-    /// How many there are.
+    /// How many are confirmed.
     pub(super) fn count(&self) -> usize {
-        self.count
+        self.now().iter().filter(|line| line.confirmed).count()
     }
 
     fn now(&self) -> &[Line] {
@@ -323,7 +333,9 @@ impl Lines {
             };
             let line = &mut self.lines[k];
             let settled = line.follow(settings, &residual, apart);
-            let gone = settled && square(line.z) < GONE * line.radial_um2;
+            let over = square(line.z) / line.radial_um2;
+            let gone = settled && over < GONE;
+            line.confirmed |= settled && over > settings.sure;
             let turn = line.turn;
             let possible = turn > settings.turn(0.5) && turn < settings.turn(BINS as f64);
             let twin = (self.lines[..k].iter())
@@ -414,7 +426,9 @@ impl Lines {
             let (_, median, _) = beside[..count].select_nth_unstable_by(count / 2, f64::total_cmp);
             let skirt = |by: i64| self.power(bin - by) + self.power(bin + by);
             let skirts: f64 = (aside..aside + SKIRT as i64).map(skirt).sum();
-            if own > settings.peak * *median && own * 2.0 * SKIRT as f64 > NARROW * skirts {
+            // Powers of noise are exponential: their mean is the median over ln 2. The rest of the skirts is the peak's own.
+            let its_own = skirts / (2.0 * SKIRT as f64) - *median / LN_2;
+            if own > settings.peak * *median && own > NARROW * its_own {
                 // Where the peak of Hann's window is between two bins.
                 let (side, sign) = if above > below {
                     (above, 1.0)

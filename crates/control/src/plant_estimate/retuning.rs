@@ -34,7 +34,8 @@ const GAINS: [f64; 2] = [0.4, 2.5];
 /// The tuning is for the gain that the plant exceeds with a probability of a third: a gain above the one tuned for costs margin, one below
 /// it a little hold error. Standard deviations of a normal distribution.
 const CAUTIOUS: f64 = 0.43;
-/// Distance from there at which the tuning sets out, standard deviations. If the logarithm is known to [`VAGUE`] only, it is twice that.
+/// Distance from there at which the tuning sets out, standard deviations. If the logarithm is known to [`VAGUE`] only, it is twice that: a
+/// change that is believed in by half, and found wrong in the next second, moves nothing.
 const SET_OUT: f64 = 1.5;
 const VAGUE: f64 = 0.2;
 /// Ticks in which the tuning settles at an estimate that it agrees with: less than the estimate needs to change.
