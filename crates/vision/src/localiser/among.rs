@@ -3,36 +3,19 @@
 //! Taking off what was fitted and fitting again converges to the fit of all beads together, at the price of single fits.
 
 use super::Localiser;
+use super::others::Others;
 use crate::fit::Image;
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::streak::Comb;
 use crate::template::Template;
 
-/// Most neighbours whose images are taken off a window.
-const MOST_OTHERS: usize = 8;
 /// Share of a bead's contrast below which there is nothing left of its image.
 const FADED: f32 = 0.03;
 /// Share of a bead's contrast below which a bad fit beside it is no bead.
 const LEAST_SHARE: f64 = 0.3;
 /// Rounds in which fits and images taken off improve each other; the last one counts. The error falls by the overlap each time.
 const ROUNDS: usize = 3;
-
-/// The beads taken off the windows of a fix: place in the frame, px, and contrast, grey levels.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Others {
-    beads: [(f64, f64, f64); MOST_OTHERS],
-    count: usize,
-}
-
-impl Others {
-    fn add(&mut self, fix: &Fix) {
-        if let Some(free) = self.beads.get_mut(self.count) {
-            *free = (fix.x_px, fix.y_px, fix.amplitude);
-            self.count += 1;
-        }
-    }
-}
 
 impl Localiser {
     /// Positions of all beads near the places given (px), into `fixes`: one a bead, of any verdict. Beads whose images overlap are
@@ -117,7 +100,7 @@ impl Localiser {
         if !self.crop.take(frame, x_px, y_px, side_px) {
             return false;
         }
-        for (x_px, y_px, contrast) in self.others.beads.iter().take(self.others.count) {
+        for (x_px, y_px, contrast) in self.others.beads() {
             let lanes_end = self.crop.lanes_end();
             let mut image = Image::new(lanes_end);
             let x = (x_px - self.crop.x0 as f64) as f32;

@@ -4,6 +4,7 @@ mod among;
 mod certainty;
 mod judge;
 mod noise;
+mod others;
 mod refine;
 mod together;
 
@@ -22,7 +23,7 @@ use crate::seed;
 use crate::speckle;
 use crate::streak::Comb;
 use crate::template::Template;
-use among::Others;
+use others::Others;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
 const CONVERGED_PX: f64 = 0.01;
