@@ -342,10 +342,12 @@ impl<R: ReferenceGenerator> Core<R> {
             .state
             .grid
             .get_or_insert_with(|| Grid::new(input.time_ns, period_ns));
-        let index = u64::try_from(grid.index(input.time_ns)).unwrap_or(0);
-        if !first && index <= self.state.index {
-            return None;
-        }
+        let index = if first {
+            0
+        } else {
+            let last = i64::try_from(self.state.index).unwrap_or(i64::MAX);
+            u64::try_from(grid.index_after(last, input.time_ns)?).ok()?
+        };
         let mut tick = Tick {
             seq: self.state.seq,
             time_ns: input.time_ns,

@@ -1,8 +1,15 @@
 //! The loop's grid of time: what makes a tick's number that of the clock.
 //!
-//! Tick `k` stands at `origin + k period`; a time belongs to the `k` that is nearest. Whatever starts a tick (a frame that
-//! is early, late or doubled, a timer), it advances the loop by the steps of this grid that have passed, so that plan,
-//! controller, estimator, learner and cycle table keep the time of the clock.
+//! Tick `k` stands at `origin + k period` and may be made up to [`REACH`] of a period before or after it. The windows of
+//! two ticks overlap, so a frame that drifts through the grid never waits for a window to open: at the end of one it
+//! stands in the middle part of the next. Whatever starts a tick (a frame that is early, late or doubled, a timer), it
+//! advances the loop by the steps of this grid that have passed, so that plan, controller, estimator, learner and cycle
+//! table keep the time of the clock.
+
+/// A tick may be made so far from its place, in parts of a period. Above a half, so that windows overlap: a phase that
+/// leaves one window has `2 REACH - 1` of a period to the nearest edge of the other one, which is what jitter has to
+/// cross before frames fall to either side in turn. Below one, so that each tick has a time that is its own.
+pub(crate) const REACH: f64 = 0.75;
 
 /// Grid of the ticks' times, ns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,7 +27,7 @@ impl Grid {
         }
     }
 
-    /// The tick that a time belongs to.
+    /// The tick that is nearest to a time.
     pub fn index(&self, time_ns: i64) -> i64 {
         time_ns
             .saturating_sub(self.origin_ns)
@@ -28,12 +35,30 @@ impl Grid {
             .div_euclid(self.period_ns)
     }
 
-    /// The first time that belongs to a tick, ns.
+    /// The first time at which a tick may be made, ns.
     pub fn opens_ns(&self, index: i64) -> i64 {
+        self.place_ns(index).saturating_sub(self.reach_ns())
+    }
+
+    /// The tick that is made at a time, after tick `last`: the next one while its window is open, later the nearest.
+    /// `None`: the next one's window is not open yet.
+    pub fn index_after(&self, last: i64, time_ns: i64) -> Option<i64> {
+        let next = last.saturating_add(1);
+        if time_ns < self.opens_ns(next) {
+            return None;
+        }
+        let open = time_ns <= self.place_ns(next).saturating_add(self.reach_ns());
+        Some(if open { next } else { self.index(time_ns) })
+    }
+
+    fn place_ns(&self, index: i64) -> i64 {
         index
             .saturating_mul(self.period_ns)
             .saturating_add(self.origin_ns)
-            .saturating_sub(self.period_ns / 2)
+    }
+
+    fn reach_ns(&self) -> i64 {
+        (self.period_ns as f64 * REACH) as i64
     }
 }
 
@@ -42,13 +67,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_time_belongs_to_the_nearest_tick_and_a_tick_opens_half_a_period_before_it() {
+    fn a_tick_is_the_next_one_while_its_window_is_open_and_then_the_nearest() {
         for (origin_ns, period_ns) in [(0, 1_000_000), (-77, 200_000), (12_345, 333_333)] {
             let grid = Grid::new(origin_ns, period_ns);
             for k in [-3, 0, 1, 2, 1_000_000_007] {
-                assert_eq!(grid.index(origin_ns + k * period_ns), k);
+                let at = |steps: f64| origin_ns + k * period_ns + (steps * period_ns as f64) as i64;
+                assert_eq!(grid.index(at(0.0)), k);
                 let opens_ns = grid.opens_ns(k);
-                assert_eq!((grid.index(opens_ns - 1), grid.index(opens_ns)), (k - 1, k));
+                assert_eq!(opens_ns, at(-REACH));
+                for (time_ns, expected) in [
+                    (opens_ns - 1, None),
+                    (opens_ns, Some(k)),
+                    (at(0.0), Some(k)),
+                    (at(REACH), Some(k)),
+                    (at(REACH) + 2, Some(k + 1)),
+                    (at(4.4), Some(k + 4)),
+                ] {
+                    assert_eq!(grid.index_after(k - 1, time_ns), expected, "{k} {time_ns}");
+                }
             }
         }
         let far = Grid::new(i64::MIN, 1);

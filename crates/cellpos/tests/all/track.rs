@@ -365,13 +365,17 @@ fn a_sine_of_300_hz_is_learned_to_twice_the_hold_error_with_half_a_millisecond_o
 fn a_bead_that_is_drawn_out_over_its_frames_is_seen_in_each_of_them() {
     let folder = tempfile::tempdir().unwrap();
     for sine in ["5um@50Hz", "5um@100Hz"] {
-        let line = format!(
-            "--target 0um --controller lqg --duration 3s --ideal --seed 5 --no-record --sine {sine}"
-        );
-        let r = track(folder.path(), &line);
-        assert!(number(&r, "fixes_lost") < 10.0, "{sine}: {r}");
-        let rms = number(&r, "rms_true_nm");
-        assert!(rms < 70.0, "{sine}: {rms} nm");
+        // One run of three seconds scatters by 2 nm.
+        let runs = [3, 4, 5, 6].map(|seed| {
+            let line = format!(
+                "--target 0um --controller lqg --duration 3s --ideal --seed {seed} --no-record --sine {sine}"
+            );
+            let r = track(folder.path(), &line);
+            assert!(number(&r, "fixes_lost") < 10.0, "{sine}, {seed}: {r}");
+            number(&r, "rms_true_nm")
+        });
+        let rms = runs.iter().sum::<f64>() / 4.0;
+        assert!(rms < 70.0, "{sine}: {runs:?} nm");
     }
 }
 

@@ -127,14 +127,14 @@ fn check(ran: &Ran, faults: &Faults) {
     }
 }
 
-/// At every tick the plan is where the clock is, whatever the frames did.
+/// At every tick the plan is where the clock is, whatever the frames did: within the reach of two ticks.
 fn check_plan(records: &[TickRecord]) {
     let closed = records.iter().find(|r| r.is_running());
     let Some(closed) = closed else { return };
     for record in records.iter().filter(|r| r.is_running()) {
         let clock_ns = record.time_ns - closed.time_ns;
         assert!(
-            (record.plan_ns - closed.plan_ns - clock_ns).abs() <= MS,
+            (record.plan_ns - closed.plan_ns - clock_ns).abs() <= 3 * MS / 2,
             "plan {} ns, clock {clock_ns} ns",
             record.plan_ns
         );
