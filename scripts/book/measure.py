@@ -77,8 +77,8 @@ def adapt(bench: Bench, figures: Figures):
         (bench.folder / "other-rig.toml").write_text('[emulator]\nmodel = "other.toml"\n')
         for state in ("on", "off"):
             runs = track(bench, f"--target 0um --rig other-rig.toml --controller lqg --adapt {state} --duration 20s --frames off")
-            figures.put(f"adapt.{factor:g}-{state}", f"hold with lqg on a plant of {factor:g} times the model's gain, adaptation {state}", mean(runs, "rms_true_nm"), "nm", 1,
-                        f"cellpos track --controller lqg --adapt {state} on such a rig, 20 s, seeds 1 to 5")
+            figures.put(f"adapt.{factor:g}-{state}", f"hold on a plant of {factor:g} times the model's gain, adaptation {state}", mean(runs, "rms_true_nm"), "nm", 1,
+                        "cellpos track --controller lqg --adapt STATE on such a rig, 20 s, seeds 1 to 5")
 
 
 def cell(bench: Bench, figures: Figures):
@@ -160,7 +160,7 @@ def vision(bench: Bench, figures: Figures):
         frames, program, recall, error = cells[0], cells[1].split()[0], cells[2], float(cells[3])
         short = {"rendered, SNR 10": "", "rendered, SNR 40": "-snr40", "beads-brightfield": "-beads", "trapped-bead": "-trapped"}.get(frames)
         if short is not None:
-            figures.put(f"vision.{program}{short}", f"{program}, {frames}: RMS error (recall {recall})", error, "px", 4, "scripts/vision-beside-trackpy.py")
+            figures.put(f"vision.{program}{short}", f"{program}, {frames}: RMS error, recall {recall}", error, "px", 4, "scripts/vision-beside-trackpy.py")
 
 
 def times(bench: Bench, figures: Figures):
@@ -186,12 +186,12 @@ def write(figures: Figures, bench: Bench):
     figures.save()
     page = ["# Measurements", "", "Every figure that the project claims. `scripts/book-measure` writes this page.", "",
             "Measured with " + ", ".join(sorted({e["program"] for e in entries})) + ".", "",
-            "Closed loops run on the emulated rig, on the virtual clock. The emulator proves what it contains and no more; see [Limits](limits.md).", ""]
+            "Closed loops run on the emulated rig, on the virtual clock. See [Limits](limits.md).", ""]
     for line in dict.fromkeys(e["command"] for e in entries):
         alike = [e for e in entries if e["command"] == line]
         page += [f"**{command(line)}** ({max(e['date'] for e in alike)})", "", "| figure | what | value |", "|---|---|---|"]
         page += [f"| `{e['id']}` | {e['what']} | {e['shown']} |" for e in alike] + [""]
-    page += ["## Long tables", "", "These take minutes to hours:", "", "| command | shows |", "|---|---|"]
+    page += ["## Tables of minutes to hours", "", "| command | shows |", "|---|---|"]
     page += [f"| `{line}` | {what} |" for line, what in LONG]
     (ROOT / "docs/measurements.md").write_text("\n".join(page) + "\n")
     (ROOT / "docs/images/proof.svg").write_text(plot.proof(entries))
