@@ -191,7 +191,7 @@ def write(figures: Figures, bench: Bench):
         alike = [e for e in entries if e["command"] == line]
         page += [f"**{command(line)}** ({max(e['date'] for e in alike)})", "", "| figure | what | value |", "|---|---|---|"]
         page += [f"| `{e['id']}` | {e['what']} | {e['shown']} |" for e in alike] + [""]
-    page += ["## Tables of minutes to hours", "", "| command | shows |", "|---|---|"]
+    page += ["## Long tables", "", "| command | shows |", "|---|---|"]
     page += [f"| `{line}` | {what} |" for line, what in LONG]
     (ROOT / "docs/measurements.md").write_text("\n".join(page) + "\n")
     (ROOT / "docs/images/proof.svg").write_text(plot.proof(entries))
