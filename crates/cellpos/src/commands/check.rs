@@ -243,8 +243,8 @@ fn sentence(check: &Check, limits: &CheckLimits) -> (Emphasis, String) {
             return (
                 Emphasis::Good,
                 format!(
-                    "The script can run within the limits of this rig. It lasts {:.1} s{cycles}, waits for an event not \
-                     counted.{room}",
+                    "The script can run within the limits of this rig. It lasts {:.1} s{cycles}, without the time that \
+                     it waits for events.{room}",
                     check.duration_s
                 ),
             );

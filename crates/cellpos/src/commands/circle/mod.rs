@@ -3,6 +3,7 @@
 //! The loop gets a model and a rig; the hidden model stays in the rig. On the emulated rig the truth is known, so the margins that
 //! each model predicts are compared with those of the loop.
 
+mod answer;
 mod report;
 
 use crate::commands::identify::new_run_folder;

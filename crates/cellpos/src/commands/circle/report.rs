@@ -1,11 +1,10 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
-use crate::commands::report::{half95, with_interval};
+use super::answer::{RUNS, error, rms, sentence, verdict_and_names};
 use crate::output::command_line;
 use cellpos_experiment::circle::Circle;
 use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
-use cellpos_experiment::circle::stage::{Stage, Tracked};
-use cellpos_reconcile::{Reconciliation, Verdict};
+use cellpos_experiment::circle::stage::Stage;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use std::path::Path;
 
@@ -17,17 +16,6 @@ fn figure(of: Option<LoopMargins>, f: impl Fn(&LoopMargins) -> Option<f64>, unit
     of.as_ref()
         .and_then(f)
         .map_or_else(|| "-".to_owned(), |v| format!("{v:.2}{unit}"))
-}
-
-fn rms(tracked: Option<&Tracked>) -> String {
-    let Some(tracked) = tracked else {
-        return "no loop".to_owned();
-    };
-    match tracked.rms_true_nm.or(tracked.rms_measured_nm) {
-        Some(nm) if tracked.state == "running" => format!("{nm:.1} nm"),
-        Some(nm) => format!("{nm:.1} nm, ended in {}", tracked.state),
-        None => format!("ended in {}", tracked.state),
-    }
 }
 
 /// One line of the table of margins.
@@ -112,20 +100,6 @@ fn bode(circle: &Circle) -> Figure {
     plot
 }
 
-/// One of a stage's two runs.
-type OfStage = fn(&Stage) -> Option<&Tracked>;
-
-const RUNS: [(&str, OfStage); 2] = [
-    ("holding", |s| s.hold.as_ref()),
-    ("on the sine", |s| s.sine.as_ref()),
-];
-
-/// RMS error of a run and half its 95 % interval, nm.
-fn error(tracked: &Tracked) -> Option<(f64, f64)> {
-    let nm = tracked.rms_true_nm.or(tracked.rms_measured_nm)?;
-    Some((nm, half95(&tracked.pieces_nm2) / (2.0 * nm)))
-}
-
 /// The error of each controller in both runs.
 fn errors(circle: &Circle) -> Figure {
     let mut plot = Figure::new(
@@ -173,111 +147,6 @@ fn traces(circle: &Circle) -> Figure {
     plot
 }
 
-/// For example `named: driver-lag + time-delay`.
-fn verdict_and_names(circle: &Circle) -> String {
-    let Reconciliation {
-        verdict, effects, ..
-    } = &circle.reconciled;
-    let names: Vec<&str> = effects.iter().map(|e| e.id.as_str()).collect();
-    format!("{}: {}", verdict.word(), names.join(" + "))
-}
-
-/// The verdict in a sentence.
-fn lacks(circle: &Circle) -> String {
-    let names: Vec<&str> = (circle.reconciled.effects.iter())
-        .map(|effect| effect.id.as_str())
-        .collect();
-    let names = names.join(" and ");
-    match circle.reconciled.verdict {
-        Verdict::Named => format!("What the model lacked was found: {names}."),
-        Verdict::NamedWithRemainder => {
-            format!(
-                "What the model lacked was found in part: {names}, and something without a name."
-            )
-        }
-        Verdict::Ambiguous => format!("The model lacks {names}; these records do not tell which."),
-        Verdict::Unknown => "The model lacks something that no known effect explains.".to_owned(),
-        Verdict::NothingMissing => "The model lacked nothing.".to_owned(),
-    }
-}
-
-/// The delay of the loop as identified and as reconciled, both from the middle of an exposure to the tick that uses it, ms.
-fn delays(circle: &Circle) -> Option<String> {
-    let identified = (circle.identified.result.judged.parameters.iter())
-        .find(|parameter| parameter.name == "effective_delay_ms")?;
-    let added = (circle.reconciled.effects.iter())
-        .find(|effect| effect.id == "time-delay")?
-        .parameters
-        .get("delay_s")?;
-    let stage = circle.stages.last()?;
-    // Half the exposure comes on top of what was added.
-    let rest_ms = stage.delay_ms - 1e3 * added.value;
-    let [low, high] = added.ci95.map(|s| 1e3 * s + rest_ms);
-    let [from, to] = identified.ci95;
-    Some(format!(
-        " Delay from a frame's exposure to its use: {:.3} ms identified (95 %: {from:.3} to {to:.3}), {:.3} ms reconciled (95 %: {low:.3} \
-         to {high:.3}).",
-        identified.value, stage.delay_ms
-    ))
-}
-
-/// What the correction was worth in one run, and the sign of a change beyond chance.
-fn worth(first: &Stage, last: &Stage, name: &str, of: OfStage) -> (String, i8) {
-    let said = |stage: &Stage| match of(stage).and_then(error) {
-        Some((nm, half)) if of(stage).is_some_and(|run| run.state == "running") => {
-            format!("{} nm", with_interval(nm, half))
-        }
-        _ => rms(of(stage)),
-    };
-    let sign = match (of(first).and_then(error), of(last).and_then(error)) {
-        (Some(before), Some(after)) if (after.0 - before.0).abs() > before.1.hypot(after.1) => {
-            if after.0 < before.0 {
-                1
-            } else {
-                -1
-            }
-        }
-        _ => 0,
-    };
-    (
-        format!("{name} {} before, {} after", said(first), said(last)),
-        sign,
-    )
-}
-
-/// What came out.
-fn sentence(circle: &Circle) -> (Emphasis, String) {
-    let mut text = lacks(circle);
-    if let Some(delays) = delays(circle) {
-        text.push_str(&delays);
-    }
-    let mut gain = 0;
-    if let [first, .., last] = circle.stages.as_slice() {
-        let (runs, signs): (Vec<String>, Vec<i8>) = RUNS
-            .iter()
-            .map(|(name, of)| worth(first, last, name, *of))
-            .unzip();
-        gain = signs.iter().sum();
-        let worse = signs.iter().any(|sign| *sign < 0);
-        let verdict = match (gain, worse) {
-            (1.., false) => "The controller of the corrected model is better",
-            (_, true) if gain < 0 => "The controller of the corrected model is worse",
-            (_, true) => {
-                "The controller of the corrected model is better in one run and worse in the other"
-            }
-            _ => "The controller of the corrected model gains nothing",
-        };
-        text.push_str(&format!(" {verdict}: RMS error {}.", runs.join("; ")));
-    }
-    let status = match circle.reconciled.verdict {
-        Verdict::Unknown => Emphasis::Bad,
-        Verdict::Ambiguous => Emphasis::Warning,
-        _ if gain > 0 => Emphasis::Good,
-        _ => Emphasis::Plain,
-    };
-    (status, text)
-}
-
 /// The page.
 pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
@@ -303,11 +172,14 @@ pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     r.figure(errors(circle));
 
     r.section("Identified");
-    let model = &circle.identified.result.judged.model;
+    let judged = &circle.identified.result.judged;
+    let model = &judged.model;
     r.paragraph(&format!(
         "K = {:.1} /s, delay {:.3} ms. The model that reconcile extended is the one {}: {}.",
         model.gain_per_s,
-        model.delay_s * 1e3,
+        judged
+            .parameter("effective_delay_ms")
+            .map_or(model.delay_s * 1e3, |delay| delay.value),
         circle.base.0,
         circle.base.1
     ));

@@ -118,8 +118,9 @@ fn sentence(request: &DesignRequest, report: &DesignReport) -> (Emphasis, String
     }
     let error = report.noise.as_ref().map_or_else(String::new, |noise| {
         format!(
-            " Predicted error of a hold: {:.0} nm RMS; the lowest possible is {:.0} nm.",
+            " Predicted error of a hold: {:.0} nm RMS; with the model's noise of a fix, {:.0} nm, the lowest possible is {:.0}.",
             noise.rms_um * 1e3,
+            request.plant.fix_noise_um * 1e3,
             report.bound_rms_um * 1e3
         )
     });

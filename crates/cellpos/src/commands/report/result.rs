@@ -295,7 +295,7 @@ fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>, what: &str, kept: bool) -> Op
     let (error, of_interval) = match ticks.rms_ci95_um() {
         Some(ci95_um) => (
             super::with_interval(1e3 * rms_um, 1e3 * ci95_um) + " nm RMS",
-            "\u{b1} is the 95 % interval that so long a piece of this one run gives. ",
+            "\u{b1} is the 95 % interval of the error in this one run, from its scatter over time. ",
         ),
         None => (format!("{} nm RMS", nm(rms_um)), ""),
     };
