@@ -20,6 +20,8 @@ use std::time::Duration;
 
 const SIDE: usize = 64;
 const WATCHED_S: i64 = 10;
+/// What the driver is told of the way from the middle of an exposure to its fastest arrival.
+const LATENCY_MS: f64 = 0.5;
 
 /// The server is killed when the test ends, however it ends.
 struct Server(Child);
@@ -43,7 +45,7 @@ fn settings(address: &str) -> IndustrialSettings {
         rate_hz: 1000.0,
         exposure_us: Some(500.0),
         bits: 8,
-        latency_ms: 0.5,
+        latency_ms: LATENCY_MS,
         buffers: 200,
     }
 }
@@ -247,17 +249,17 @@ fn number(buffer: &FrameBuffer) -> u32 {
     u32::from_be_bytes(bytes.unwrap())
 }
 
-/// Judges the time stamps by when the pictures were made, however late they came: `latency_ms` is told to be the time from the
+/// Judges the time stamps by when the pictures were made, however late they came: [`LATENCY_MS`] is told to be the time from the
 /// middle of the exposure to the fastest arrival, so a stamp is the picture's time, plus the fastest way, minus that.
 fn judge(stamps: &[(u32, FrameStamp)]) {
     let made_ns = MADE_NS.lock().unwrap();
     let made = |n: u32| made_ns[n as usize];
     let ways = stamps.iter().map(|&(n, s)| s.arrival_ns - made(n));
     let (fastest_ns, slowest_ns) = (ways.clone().min().unwrap(), ways.max().unwrap());
-    let expected_ns = fastest_ns - (settings("").latency_ms * 1e6) as i64;
-    // The first second teaches the offset of the two clocks.
-    let settled = stamps.len().min(1000);
-    let mut off_ns: Vec<i64> = stamps[settled / 2..]
+    let expected_ns = fastest_ns - (LATENCY_MS * 1e6) as i64;
+    // The first half second at most teaches the offset of the two clocks.
+    let settled = (stamps.len() / 2).min(500);
+    let mut off_ns: Vec<i64> = stamps[settled..]
         .iter()
         .map(|&(n, s)| s.mid_exposure_ns - made(n) - expected_ns)
         .collect();

@@ -336,6 +336,31 @@ impl Lab {
         self.set.find(&mut self.finder, picture, &mut self.random)
     }
 
+    /// Draws two cells at their places into a frame, unless the second is cut by it, and counts what the finder makes of them.
+    pub(crate) fn pair(
+        &mut self,
+        row: &mut Row,
+        first: (&Known, (f64, f64)),
+        second: (&Known, (f64, f64)),
+    ) {
+        let ((known, place), (other, there)) = (first, second);
+        let (top, bottom) = (there.1 - other.cut.half.1, there.1 + other.cut.half.1);
+        if top < 4.0 || bottom > self.set.empty.height as f64 - 5.0 {
+            return;
+        }
+        let picture = self.set.composed(&[
+            (&known.cut.contrast, &known.cut, place),
+            (&other.cut.contrast, &other.cut, there),
+        ]);
+        let found = self.find(&picture);
+        row.drawn += 1;
+        row.said += usize::from(found.iter().any(|c| c.in_contact));
+        let ratio = |c: &Cell| c.area_px / known.alone.area_px;
+        row.areas
+            .extend(found.iter().filter(|c| good(c)).map(ratio));
+        row.wrong(&found, &[first, second]);
+    }
+
     /// A row of single cells, each with its contrast changed first and the whole frame then; the place is moved by so much.
     pub(crate) fn row(
         &mut self,

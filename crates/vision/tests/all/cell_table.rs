@@ -1,8 +1,7 @@
 //! The table of cells: what the finder makes of overlaps, borders, blur, moved walls and motion.
 
-use crate::cell_lab::{Cut, Lab, Row, SETS, blurred, good};
+use crate::cell_lab::{Cut, Lab, Row, SETS, blurred};
 use crate::common::change::Picture;
-use cellpos_vision::Cell;
 
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
@@ -13,29 +12,15 @@ fn two_cells_that_overlap_are_not_one_good_cell() {
         for apart in [0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.1, 1.4] {
             let mut row = Row::default();
             for (n, known) in cells.iter().enumerate() {
-                let (cut, place) = (&known.cut, lab.set.middle(&known.cut));
+                let place = lab.set.middle(&known.cut);
                 for (turn, angle) in [0.0, 0.4, 0.8, 1.6, -0.8].into_iter().enumerate() {
                     let other = &cells[(n + turn) % cells.len()];
-                    let px = apart * (cut.half.0 + other.cut.half.0);
+                    let px = apart * (known.cut.half.0 + other.cut.half.0);
                     let there = (
                         place.0 + px * f64::cos(angle),
                         place.1 + px * f64::sin(angle),
                     );
-                    let (top, bottom) = (there.1 - other.cut.half.1, there.1 + other.cut.half.1);
-                    if top < 4.0 || bottom > lab.set.empty.height as f64 - 5.0 {
-                        continue;
-                    }
-                    let picture = lab.set.composed(&[
-                        (&cut.contrast, cut, place),
-                        (&other.cut.contrast, &other.cut, there),
-                    ]);
-                    let found = lab.find(&picture);
-                    row.drawn += 1;
-                    row.said += usize::from(found.iter().any(|c| c.in_contact));
-                    let ratio = |c: &Cell| c.area_px / known.alone.area_px;
-                    row.areas
-                        .extend(found.iter().filter(|c| good(c)).map(ratio));
-                    row.wrong(&found, &[(known, place), (other, there)]);
+                    lab.pair(&mut row, (known, place), (other, there));
                 }
             }
             row.print(lab.name, &format!("overlap {apart}"));
@@ -78,22 +63,8 @@ fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
                 place.0 + apart * (known.cut.half.0 + other.cut.half.0) * angle.cos(),
                 place.1 + apart * (known.cut.half.1 + other.cut.half.1) * angle.sin(),
             );
-            let half = other.cut.half.1;
-            if there.1 - half < 4.0 || there.1 + half > lab.set.empty.height as f64 - 5.0 {
-                continue;
-            }
-            let picture = lab.set.composed(&[
-                (&known.cut.contrast, &known.cut, place),
-                (&other.cut.contrast, &other.cut, there),
-            ]);
-            let found = lab.find(&picture);
             let row = &mut rows[((apart - 0.35) * 4.0) as usize];
-            row.drawn += 1;
-            row.said += usize::from(found.iter().any(|c| c.in_contact));
-            let ratio = |c: &Cell| c.area_px / known.alone.area_px;
-            row.areas
-                .extend(found.iter().filter(|c| good(c)).map(ratio));
-            row.wrong(&found, &[(known, place), (other, there)]);
+            lab.pair(row, (known, place), (other, there));
         }
         for (row, apart) in
             rows.iter_mut()

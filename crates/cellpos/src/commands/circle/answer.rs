@@ -103,7 +103,7 @@ fn worth(first: &Stage, last: &Stage, name: &str, of: OfStage) -> (String, i8) {
     )
 }
 
-/// What changes beyond chance are worth together: 1 is a run that became better, -1 one that became worse.
+/// The verdict on all runs: 1 is a run that became better beyond chance, -1 one that became worse.
 fn verdict(signs: &[i8]) -> String {
     let runs = signs.len();
     let [better, worse] = [1, -1].map(|sign| signs.iter().filter(|one| **one == sign).count());
