@@ -9,7 +9,7 @@ use crate::imperfections::Wander;
 use crate::partner::PressurePartner;
 use crate::render::{Renderer, localisation_bound_um, mean_between};
 use crate::second_bead::{self, confined};
-use crate::zero_flow::{ZeroFlow, gain_per_s};
+use crate::zero_flow::ZeroFlow;
 use cellpos_numeric::Random;
 use cellpos_plant::effects::{Action, Shown};
 use cellpos_plant::{Chain, Model, Noise};
@@ -41,8 +41,6 @@ pub struct World {
     zero_flow: ZeroFlow,
     /// Where the zero flow is now, um from the mean.
     zero_flow_um: f64,
-    /// Speed of the bead over displacement of the PZT from the zero flow, 1/s.
-    gain_per_s: f64,
     focus: Wander,
     defocus: f64,
     /// Of the angle between the rows of the picture and the channel.
@@ -109,7 +107,6 @@ impl World {
         Ok(Self {
             camera: Camera::new(config, model, start_ns),
             offset_um: config.start_um - chain.bead_um(),
-            gain_per_s: gain_per_s(model),
             chain,
             partner: None,
             zero_flow: ZeroFlow::new(config),
@@ -255,16 +252,16 @@ impl World {
         let dt_s = (t_ns - self.now_ns) as f64 * 1e-9;
         let before_um = self.chain.bead_um();
         let at_um = self.bead_um();
-        let beside_um = self.partner.as_mut().map_or(0.0, |p| p.advance(dt_s));
-        self.chain
-            .advance(self.reached_um(applied_um) + beside_um, dt_s);
+        let stepped = self.active(FaultKind::FlowStep);
+        self.zero_flow_um = self.zero_flow.advance(dt_s, stepped);
+        let partner_um = self.partner.as_mut().map_or(0.0, |p| p.advance(dt_s));
+        self.chain.set_beside_um(partner_um - self.zero_flow_um);
+        self.chain.advance(self.reached_um(applied_um), dt_s);
         if let Some(cell) = &mut self.cell {
             self.offset_um += cell.surplus_um(at_um, self.chain.bead_um() - before_um);
             cell.advance(at_um, dt_s);
         }
-        let stepped = self.active(FaultKind::FlowStep);
-        self.zero_flow_um = self.zero_flow.advance(dt_s, stepped);
-        self.offset_um += (self.config.drift_um_per_s - self.gain_per_s * self.zero_flow_um) * dt_s;
+        self.offset_um += self.config.drift_um_per_s * dt_s;
         let spread_um = (2.0 * self.config.diffusion_um2_per_s * dt_s).sqrt();
         self.lateral_um = confined(
             self.lateral_um + spread_um * self.brownian.normal(),
@@ -352,8 +349,7 @@ impl World {
         }
         let since_ns = *self.out_since_ns.get_or_insert(self.now_ns);
         // A bead that crosses the frame in less than five hundred exposures is no use to anybody.
-        let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s
-            - self.gain_per_s * self.zero_flow_um;
+        let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s;
         let field_um = f64::from(self.config.width_px) * self.config.pixel_um;
         let slow = flow_um_per_s.abs() < 0.002 * field_um * self.config.rate_hz;
         if slow && (self.now_ns - since_ns) as f64 * 1e-6 >= after_ms {

@@ -6,11 +6,7 @@
 use crate::config::WorldConfig;
 use crate::imperfections::Wander;
 use cellpos_numeric::Random;
-use cellpos_plant::Model;
-use cellpos_units::Hertz;
 
-/// Frequency at which the gain of a plant without a slow pole-zero pair is read: the middle of the band of a loop at 1 kHz.
-const STEP_FREQUENCY: Hertz = Hertz(30.0);
 /// Distance of the zero flow from [`WorldConfig::neutral_um`], um.
 #[derive(Debug, Clone)]
 pub(crate) struct ZeroFlow {
@@ -38,14 +34,6 @@ impl ZeroFlow {
         self.drifted_um += self.drift_um_per_s * dt_s;
         self.wander.advance(dt_s) + self.drifted_um + if stepped { self.step_um } else { 0.0 }
     }
-}
-
-/// Speed of the bead over displacement, 1/s: the immediate effect of a step of the zero flow.
-pub(crate) fn gain_per_s(model: &Model) -> f64 {
-    let plant = &model.plant;
-    plant
-        .velocity_gain_above_pair()
-        .unwrap_or_else(|| plant.velocity_gain_at(STEP_FREQUENCY))
 }
 
 #[cfg(test)]

@@ -86,6 +86,8 @@ pub struct Chain {
     time_s: f64,
     command_um: f64,
     driver_um: f64,
+    /// Displacement that acts on the flow beside the PZT's, um.
+    beside_um: f64,
     output: Piece,
     offset_um: f64,
     area_um_s: f64,
@@ -123,6 +125,7 @@ impl Chain {
             time_s: 0.0,
             command_um: 0.0,
             driver_um: 0.0,
+            beside_um: 0.0,
             output: Piece::default(),
             offset_um: 0.0,
             area_um_s: 0.0,
@@ -179,6 +182,7 @@ impl Chain {
         self.time_s = 0.0;
         self.command_um = 0.0;
         self.driver_um = 0.0;
+        self.beside_um = 0.0;
         self.output = Piece::default();
         self.offset_um = 0.0;
         self.area_um_s = 0.0;
@@ -232,6 +236,24 @@ impl Chain {
         }
     }
 
+    /// Sets what acts on the flow beside the PZT, as the displacement of the PZT with the same effect \[um\], from now on: pressure of
+    /// a second actuator, or reservoirs whose heights differ. It enters the chip and neither the driver nor the PZT. A value that is not
+    /// finite is ignored.
+    ///
+    /// ```
+    /// use cellpos_plant::{Chain, Model};
+    /// let mut chain = Chain::new(&Model::eq6()).unwrap();
+    /// chain.set_beside_um(-1.0);
+    /// chain.advance(5.0, 0.1); // 1 um beyond the working point of 4 um: the two cancel
+    /// assert_eq!(chain.bead_um(), 0.0);
+    /// assert_eq!(chain.pzt_um(), 5.0);
+    /// ```
+    pub fn set_beside_um(&mut self, beside_um: f64) {
+        if beside_um.is_finite() {
+            self.beside_um = beside_um;
+        }
+    }
+
     /// A straight line of the driver's output, in sub-steps if necessary.
     fn divided(&mut self, h_s: f64, start: f64, end: f64) {
         if h_s <= self.compiled.substep_s {
@@ -262,6 +284,9 @@ impl Chain {
                     beside.speed_start += way.speed_start;
                     beside.speed_end += way.speed_end;
                 }
+                signal.start += self.beside_um;
+                signal.end += self.beside_um;
+                signal.integral += self.beside_um * h_s;
             }
             signal = match stage {
                 Stage::Linear(group) => group.advance(h_s, signal, want),
@@ -310,7 +335,7 @@ impl Chain {
     /// backlash.
     pub fn pzt_um(&self) -> f64 {
         let reached = match self.compiled.stages.get(self.compiled.plant) {
-            Some(Stage::Linear(group)) => group.tapped(),
+            Some(Stage::Linear(group)) => group.tapped() - self.beside_um,
             _ => self.driver_um,
         };
         self.working_point_um + reached
