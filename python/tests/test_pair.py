@@ -1,6 +1,6 @@
 """A pair over firmware-sim: its board is the PZT, a function in Python the slow actuator.
 
-The function moves no bead here: the interface is tested, not the physics (crates/experiment/tests/pair.rs)."""
+The function moves no bead here: the interface is tested, not the physics (crates/workbench/tests/all/pair.rs)."""
 
 import re
 import threading

@@ -125,7 +125,7 @@ fn execute(cli: Cli, command: String) -> CommandResult {
 
 /// The program: the process's own arguments, signals, log and exit code.
 pub fn main() -> ExitCode {
-    cellpos_terminal::panics_do_not_wait();
+    cellpos_live::terminal::panics_do_not_wait();
     outcome::set_for_people();
     if let Err(error) = signals::listen() {
         eprintln!(
@@ -142,7 +142,7 @@ pub fn main() -> ExitCode {
         Err(error) => return outcome::exit_arguments(&error, json),
     };
     let lines = tracing_subscriber::fmt::layer()
-        .with_writer(|| cellpos_terminal::Log)
+        .with_writer(|| cellpos_live::terminal::Log)
         .with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr()))
         .without_time()
         .with_target(false);

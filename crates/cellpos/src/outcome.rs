@@ -1,8 +1,8 @@
 //! How a command ends: exit codes, JSON on standard output, errors on standard error.
 
 use crate::arguments::about_a_whole_number;
+use cellpos_live::terminal::{Colours, clean};
 pub use cellpos_session::Failure;
-use cellpos_terminal::{Colours, clean};
 use serde::Serialize;
 use std::borrow::Cow;
 use std::process::ExitCode;
@@ -69,13 +69,13 @@ fn for_people_at<'a>(stream: &impl std::io::IsTerminal, text: &'a str) -> Cow<'a
 /// Text on standard error is set for people, if they read it.
 pub(crate) fn set_for_people() {
     if std::io::IsTerminal::is_terminal(&std::io::stderr()) && reads_utf8() {
-        cellpos_terminal::typeset_with(cellpos_report::typeset);
+        cellpos_live::terminal::typeset_with(cellpos_report::typeset);
     }
 }
 
 /// Prints a line on standard error, for a command that holds no rig.
 pub(crate) fn print_err(line: &str) {
-    eprintln!("{}", cellpos_terminal::for_people(line));
+    eprintln!("{}", cellpos_live::terminal::for_people(line));
 }
 
 /// Whether the terminal's locale has letters beyond ASCII.
@@ -91,7 +91,7 @@ fn reads_utf8() -> bool {
 fn print(text: &str) -> Result<(), Failure> {
     use std::io::Write;
     // The summary comes after the messages of the run.
-    cellpos_terminal::stderr().flush(PATIENCE);
+    cellpos_live::terminal::stderr().flush(PATIENCE);
     match std::io::stdout().write_all(clean(text, Colours::Kept).as_bytes()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(
             miette::miette!("standard output: cannot be written: {error}"),
@@ -165,7 +165,7 @@ pub(crate) fn exit(result: CommandResult, json: bool) -> ExitCode {
         Err(Failure::BadInput(report)) => (2, "bad-input", report),
     };
     let report = told_once(report);
-    cellpos_terminal::stderr().flush(PATIENCE);
+    cellpos_live::terminal::stderr().flush(PATIENCE);
     // Files are quoted in it: nothing in them gives orders to the terminal.
     print_err(&clean(&format!("{report:?}"), Colours::Kept));
     if json {

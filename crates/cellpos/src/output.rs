@@ -93,7 +93,7 @@ impl TermLike for Screen {
         Ok(())
     }
     fn flush(&self) -> std::io::Result<()> {
-        cellpos_terminal::stderr().show(self.line().trim_end());
+        cellpos_live::terminal::stderr().show(self.line().trim_end());
         Ok(())
     }
 }

@@ -1,4 +1,4 @@
-//! The live page of a run: picture, traces, events and the stop key in a browser.
+//! What people see of a run while it goes: the live page in a browser, and the [`terminal`].
 //!
 //! A [`Feed`] takes rows, pictures, events and the state from the threads of a run. None of its calls waits. If a ring is full,
 //! the item is dropped and counted. [`Server::start`] serves one page, which is part of the program, on its own threads:
@@ -52,6 +52,7 @@ mod server;
 #[cfg(feature = "server")]
 mod shared;
 mod state;
+pub mod terminal;
 
 #[cfg(feature = "server")]
 pub use access::{Role, Secrets};

@@ -79,7 +79,7 @@ impl Recording {
     pub fn into_writer(self) -> Option<RunWriter> {
         if self.line.is_some() {
             // The last line stays above the command's output.
-            cellpos_terminal::stderr().leave();
+            cellpos_live::terminal::stderr().leave();
         }
         self.writer
     }
@@ -153,8 +153,13 @@ impl RunSink for Recording {
             writer.poll();
         }
         if let (Some(line), Some(record)) = (&self.line, statistics.last()) {
-            let text = line.text(record, statistics, self.late, cellpos_terminal::columns());
-            cellpos_terminal::stderr().show(&text);
+            let text = line.text(
+                record,
+                statistics,
+                self.late,
+                cellpos_live::terminal::columns(),
+            );
+            cellpos_live::terminal::stderr().show(&text);
         }
     }
 }

@@ -2,5 +2,5 @@
 
 /// Says a line on standard error, without ever waiting for it.
 pub fn say(line: impl AsRef<str>) {
-    cellpos_terminal::stderr().say(line.as_ref());
+    cellpos_live::terminal::stderr().say(line.as_ref());
 }

@@ -140,7 +140,7 @@ fn act(signal: i32) {
             return;
         }
         if !matches!(signal, SIGUSR1 | SIGUSR2) {
-            cellpos_terminal::give_back();
+            cellpos_live::terminal::give_back();
             // The desk stays closed meanwhile: nobody arms a board while the program ends.
             let _ = emulate_default_handler(signal);
         }

@@ -1,11 +1,11 @@
-//! Work at the bench, before the loop is closed. Each task opens the devices of a rig file without a tracker ([`Bench`]) and
-//! leaves the board parked.
+//! Work at the bench, before the loop is closed, and the [`experiment`]s on a rig. Each task at the bench opens the devices of a rig
+//! file without a tracker ([`Bench`]) and leaves the board parked.
 //!
 //! - [`template`] writes a commented rig file, [`check`] compares one with itself and with its devices.
 //! - [`line_test`] measures the line to the board; [`mover`] moves the PZT by hand.
 //! - [`snapshot`] takes a picture, [`capture`] records frames, [`sight`] measures the noise of a position.
 //! - [`beads`] finds the look of the beads, [`calibrate`] axis, sign and scale; [`partner`] the slow actuator.
-//! - [`prove`] tests board, camera and vision line by line.
+//! - [`prove`] tests board, camera and vision line by line, [`doctor`] the machine.
 //!
 //! Closed loops are in `cellpos-session`.
 //!
@@ -26,6 +26,8 @@ pub mod calibrate;
 pub mod capture;
 pub mod check;
 mod connected;
+pub mod doctor;
+pub mod experiment;
 mod finding;
 pub mod line_test;
 pub mod mover;

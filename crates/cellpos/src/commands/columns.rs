@@ -2,10 +2,10 @@
 
 use super::arrays::read_table;
 use crate::outcome::Failure;
-use cellpos_experiment::collect::{EXPOSURE, FRAME_AGE, refused};
 use cellpos_reconcile::Record;
 use cellpos_table::{ColumnRef, Table};
 use cellpos_units::Hertz;
+use cellpos_workbench::experiment::collect::{EXPOSURE, FRAME_AGE, refused};
 use std::path::Path;
 
 /// Columns of a record, and how they are to be taken.

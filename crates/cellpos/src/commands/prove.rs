@@ -1,15 +1,16 @@
 //! `cellpos rig prove`: a sheet for the lab book, line by line with numbers, and the conformance tests of board and camera server.
 
-use super::doctor;
 use crate::arguments::positive;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ActuatorConfig, CameraConfig, Frames, RigFile};
-use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_session::connect::describe;
+use cellpos_session::signals;
 use cellpos_units::{Micrometers, Seconds};
 use cellpos_workbench::Bench;
+use cellpos_workbench::doctor;
+use cellpos_workbench::experiment::on_rig::OnRig;
 use cellpos_workbench::prove::{self, Line, Sheet, Talk, Verdict, board::Trial};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -231,17 +232,18 @@ fn led(sheet: &mut Sheet, bench: &Bench) {
 
 fn machine(sheet: &mut Sheet) {
     let limit = "cellpos doctor calls it fit for 1 kHz";
-    match doctor::verdict_after(Duration::from_secs(5)) {
-        Ok((fit, words, p999_us)) => {
+    let stop = signals::ends_measuring();
+    match doctor::examine(Duration::from_secs(5), false, None, &stop) {
+        Ok(it) => {
             sheet.judge(
                 ("machine", "doctor's verdict"),
-                fit,
-                (p999_us, "us"),
+                it.fit,
+                (it.soak.wake_us.p999, "us"),
                 limit,
-                words,
+                it.verdict,
             );
         }
-        Err(failure) => sheet.leave(("machine", "doctor's verdict"), &describe(&failure)),
+        Err(error) => sheet.leave(("machine", "doctor's verdict"), &error.to_string()),
     }
 }
 

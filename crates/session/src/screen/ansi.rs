@@ -59,7 +59,10 @@ impl Backend for Ansi {
                 ""
             };
             let (front, back) = (colour(cell.fg, 3), colour(cell.bg, 4));
-            let symbol = cellpos_terminal::clean(cell.symbol(), cellpos_terminal::Colours::Removed);
+            let symbol = cellpos_live::terminal::clean(
+                cell.symbol(),
+                cellpos_live::terminal::Colours::Removed,
+            );
             let symbol = symbol.replace(['\n', '\t'], " ");
             self.say(format_args!("\x1b[0{bold};{front};{back}m{symbol}"));
             at = Some((x + 1, y));
@@ -102,7 +105,7 @@ impl Backend for Ansi {
     }
 
     fn size(&self) -> Result<Size, Infallible> {
-        let (columns, rows) = cellpos_terminal::size();
+        let (columns, rows) = cellpos_live::terminal::size();
         Ok(Size::new(columns, rows))
     }
 

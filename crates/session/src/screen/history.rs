@@ -98,7 +98,7 @@ impl History {
 
 /// A sentence of the program as a person reads it: units with their signs, and the cell where one is followed.
 fn words(text: &str, cell: bool) -> String {
-    let set = cellpos_terminal::for_people(text);
+    let set = cellpos_live::terminal::for_people(text);
     if !cell {
         return set.into_owned();
     }

@@ -4,7 +4,7 @@
 //! recorder thread -> ring -> screen thread (a picture of cells) -> terminal thread -> terminal
 //! ```
 //!
-//! The screen thread draws ten times a second and never writes: its drawing goes to [`cellpos_terminal`], and only its thread
+//! The screen thread draws ten times a second and never writes: its drawing goes to [`cellpos_live::terminal`], and only its thread
 //! waits for the terminal. A picture that finds the one before it unwritten is left out, and the next one is drawn whole.
 
 #[cfg(feature = "screen")]

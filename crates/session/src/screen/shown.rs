@@ -5,8 +5,8 @@ use super::ansi::Ansi;
 use super::draw;
 use super::history::History;
 use crate::beside::beside_the_loop;
+use cellpos_live::terminal::Terminal;
 use cellpos_live::{FeedHub, Line};
-use cellpos_terminal::Terminal;
 use ratatui::Terminal as Cells;
 use std::io;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ impl Screen {
                 "--tui needs a terminal behind standard error",
             ));
         }
-        let terminal = cellpos_terminal::stderr();
+        let terminal = cellpos_live::terminal::stderr();
         terminal.open_screen();
         let stop = Arc::new(AtomicBool::new(false));
         let mut shown = Shown {
@@ -71,7 +71,7 @@ impl Drop for Screen {
             // One that panicked has drawn nothing further.
             let _ = thread.join();
         }
-        cellpos_terminal::stderr().close_screen(PATIENCE);
+        cellpos_live::terminal::stderr().close_screen(PATIENCE);
     }
 }
 

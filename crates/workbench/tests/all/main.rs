@@ -1,4 +1,6 @@
-//! The bench's conformance tests against boards that keep the protocol and boards that do not.
+//! Work at the bench and experiments on the emulated rig.
 
 mod board_line;
+mod lost_bead;
+mod pair;
 mod prove_board;

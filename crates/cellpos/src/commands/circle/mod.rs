@@ -10,11 +10,11 @@ use crate::commands::identify::new_run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
-use cellpos_experiment::circle::stage::{Motion, Stage};
-use cellpos_experiment::circle::{Circle, Job, close};
-use cellpos_experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_units::{Hertz, Micrometers, Seconds};
+use cellpos_workbench::experiment::circle::stage::{Motion, Stage};
+use cellpos_workbench::experiment::circle::{Circle, Job, close};
+use cellpos_workbench::experiment::on_rig::OnRig;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 

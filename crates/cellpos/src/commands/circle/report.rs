@@ -2,10 +2,10 @@
 
 use super::answer::{RUNS, error, rms, sentence, verdict_and_names};
 use crate::output::command_line;
-use cellpos_experiment::circle::Circle;
-use cellpos_experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
-use cellpos_experiment::circle::stage::Stage;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_workbench::experiment::circle::Circle;
+use cellpos_workbench::experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
+use cellpos_workbench::experiment::circle::stage::Stage;
 use std::path::Path;
 
 fn effects(stage: &Stage) -> String {

@@ -3,11 +3,11 @@
 pub(crate) use super::bode::{Shown, bode, log_grid};
 use super::tables::interval;
 pub(crate) use super::tables::{candidates, lines, number, parameters};
-use cellpos_experiment::identify::Done;
 use cellpos_ident::frequency_response::FrequencyPoint;
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
 use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
+use cellpos_workbench::experiment::identify::Done;
 
 /// Nyquist plot of the record and the fitted model with hold and delay.
 pub(crate) fn nyquist(result: &Identification) -> Figure {
@@ -108,7 +108,7 @@ pub(crate) fn traces(done: &Done) -> Figure {
 pub(crate) fn delay_test(
     name: &str,
     caption: &str,
-    led: &cellpos_experiment::identify::led::DelayTest,
+    led: &cellpos_workbench::experiment::identify::led::DelayTest,
 ) -> Figure {
     let first = led.switched_s.first().copied().unwrap_or(0.0);
     let until = led.switched_s.get(4).copied().unwrap_or(first) + 0.006;

@@ -10,8 +10,6 @@ mod table;
 use super::identify::new_run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_emulator::WorldConfig;
-use cellpos_experiment::identify::held_bead::{HeldBead, Setup};
-use cellpos_experiment::identify::{Done, Excitation, Job, run as identify};
 use cellpos_ident::bare_fft;
 use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ, Signal, Tone};
 use cellpos_ident::experiment::{Cause, Plan, PlannedSegment, RecordedSegment};
@@ -19,6 +17,8 @@ use cellpos_ident::frequency_response::{DrivenStretch, Settings, measure};
 use cellpos_plant::Model;
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_rig::Clock;
+use cellpos_workbench::experiment::identify::held_bead::{HeldBead, Setup};
+use cellpos_workbench::experiment::identify::{Done, Excitation, Job, run as identify};
 use std::path::PathBuf;
 
 /// Arguments of `cellpos paper`.

@@ -7,7 +7,6 @@ use crate::commands::form;
 use crate::commands::identify::HoldKind;
 use crate::commands::simulate::response;
 use crate::outcome::Failure;
-use cellpos_experiment::collect::refused;
 use cellpos_ident::base::{Form, Series};
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::effects::Action;
@@ -15,6 +14,7 @@ use cellpos_plant::{
     Effect, Model, Noise, Place, Sampled, SimulateOptions, TransferFunction, simulate,
 };
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
+use cellpos_workbench::experiment::collect::refused;
 
 /// Records and their properties.
 pub(super) struct Data<'a> {

@@ -3,13 +3,13 @@
 use crate::commands::columns::{self, Wanted};
 use crate::commands::run::resume::sessions;
 use crate::outcome::Failure;
-use cellpos_experiment::collect::{neutral_um, refused};
-use cellpos_experiment::on_rig::{frame_age_ns, is_unseen};
 use cellpos_plant::effects;
 use cellpos_plant::{Hertz, Model, Noise, TransferFunction};
 use cellpos_reconcile::Record;
 use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
+use cellpos_workbench::experiment::collect::{neutral_um, refused};
+use cellpos_workbench::experiment::on_rig::{frame_age_ns, is_unseen};
 use std::path::{Path, PathBuf};
 
 /// Where CSV files have what, and in which units.

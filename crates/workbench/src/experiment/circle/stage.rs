@@ -1,7 +1,7 @@
 //! One step of the circle: a controller designed on a model, its margins there and on the truth, and a run with it.
 
 use super::margins::{AMPLITUDES_UM, LoopMargins, Response, margins};
-use crate::on_rig::OnRig;
+use crate::experiment::on_rig::OnRig;
 use cellpos_control::LinearLaw;
 use cellpos_control::design::DesignPlant;
 use cellpos_plant::Model;

@@ -6,7 +6,7 @@ use std::path::Path;
 /// How bad it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum Weight {
+pub enum Weight {
     /// As it should be.
     Good,
     /// May cost some microseconds, or a run under other circumstances.
@@ -17,7 +17,7 @@ pub(super) enum Weight {
 
 /// One thing that was looked at.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct Finding {
+pub struct Finding {
     /// What was looked at.
     pub what: &'static str,
     /// What was found.

@@ -1,12 +1,12 @@
 //! An experiment in which the bead is lost for a while, on the emulated rig and the virtual clock.
 
 use cellpos_emulator::{FaultEvent, FaultKind};
-use cellpos_experiment::on_rig::{Listener, OnRig, Trouble};
 use cellpos_ident::excitation::{Signal, Tone};
 use cellpos_ident::experiment::{Plan, PlannedSegment, Turn};
 use cellpos_plant::Model;
 use cellpos_session::RigFile;
 use cellpos_session::rig_file::Frames;
+use cellpos_workbench::experiment::on_rig::{Listener, OnRig, Trouble};
 
 /// Ticks at rest before the first segment.
 const REST: usize = 500;

@@ -10,11 +10,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 /// A wake-up later than this is one to be explained, ns: a fifth of the period.
-pub(super) const LATE_NS: u64 = 200_000;
+pub const LATE_NS: u64 = 200_000;
 
 /// What the loop measured.
 #[derive(Debug, Clone, Serialize)]
-pub(super) struct Soak {
+pub struct Soak {
     /// What was obtained.
     pub conditions: Conditions,
     /// How long it ran, s.

@@ -12,14 +12,12 @@
 //! text. The result of a command goes to standard output instead, when nothing waits any more.
 //!
 //! ```
-//! use cellpos_terminal::{Colours, clean};
+//! use cellpos_live::terminal::{Colours, clean};
 //! // A note from a file that would clear the screen and rename the window.
 //! let note = "cell 7\u{1b}[2J\u{1b}]0;mine\u{7} lost";
 //! let shown = clean(note, Colours::Removed);
 //! assert!(!shown.contains('\u{1b}') && shown.contains("cell 7"));
 //! ```
-#![forbid(unsafe_code)]
-
 mod people;
 mod screen;
 

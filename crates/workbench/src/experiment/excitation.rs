@@ -3,7 +3,7 @@
 //! Which one is wanted follows from the names that the records leave open. All keep the bead in view and run unattended; experiments
 //! that need hands (another bead, the fluid disconnected) are not here.
 
-use crate::on_rig::OnRig;
+use crate::experiment::on_rig::OnRig;
 use cellpos_ident::excitation::{Signal, Tone};
 use cellpos_ident::experiment::{Plan, PlannedSegment};
 use cellpos_session::Failure;

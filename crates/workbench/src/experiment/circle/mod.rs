@@ -6,10 +6,10 @@
 pub mod margins;
 pub mod stage;
 
-use crate::collect::{self, Collected, Collecting, Ran};
-use crate::excitation::Experiment;
-use crate::identify::{self, Done, Excitation};
-use crate::on_rig::OnRig;
+use crate::experiment::collect::{self, Collected, Collecting, Ran};
+use crate::experiment::excitation::Experiment;
+use crate::experiment::identify::{self, Done, Excitation};
+use crate::experiment::on_rig::OnRig;
 use cellpos_ident::excitation::PAPER_FREQUENCIES_HZ;
 use cellpos_plant::{Model, effects};
 use cellpos_reconcile::{Options, Reconciliation};

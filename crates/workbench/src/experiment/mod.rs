@@ -8,8 +8,8 @@
 //! A segment of an experiment, on the emulated rig (another: `RigFile::load` with a path):
 //!
 //! ```
-//! use cellpos_experiment::excitation::Experiment;
-//! use cellpos_experiment::on_rig::{Listener, OnRig};
+//! use cellpos_workbench::experiment::excitation::Experiment;
+//! use cellpos_workbench::experiment::on_rig::{Listener, OnRig};
 //! use cellpos_ident::experiment::Turn;
 //! use cellpos_session::{RigFile, rig_file::Frames};
 //! # fn main() -> Result<(), cellpos_session::Failure> {
@@ -21,8 +21,6 @@
 //! # Ok(())
 //! # }
 //! ```
-#![forbid(unsafe_code)]
-
 mod camera_rate;
 pub mod circle;
 pub mod collect;

@@ -4,7 +4,7 @@ pub mod held_bead;
 pub mod led;
 mod partial;
 
-use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
+use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
 use cellpos_ident::excitation::ExcitationLimits;
 use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn, common_age_s};
 use cellpos_ident::frequency_response::Settings;

@@ -1,8 +1,8 @@
 //! `cellpos reconcile --collect`: runs the experiment that would decide, on the rig, through the loop of `cellpos track`,
 //! adds its record to the data, and looks again.
 
-use crate::excitation::Experiment;
-use crate::on_rig::{Acquired, Listener, OnRig, Trouble};
+use crate::experiment::excitation::Experiment;
+use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
 use cellpos_ident::experiment::Turn;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};

@@ -1,7 +1,5 @@
 //! The pair: a PZT of a short stroke and a slow pressure controller without end, on the emulated rig and the virtual clock.
 
-use cellpos_experiment::on_rig::OnRig;
-use cellpos_experiment::partner::{Measured, Moves, measure};
 use cellpos_plant::Model;
 use cellpos_runtime::replay::Replay;
 use cellpos_runtime::{
@@ -10,6 +8,8 @@ use cellpos_runtime::{
 use cellpos_session::rig_file::{ClockKind, Frames};
 use cellpos_session::setup::{ReferenceSpec, Setup};
 use cellpos_session::{EndKind, Ended, Options, Rig, RigFile};
+use cellpos_workbench::experiment::on_rig::OnRig;
+use cellpos_workbench::experiment::partner::{Measured, Moves, measure};
 use std::collections::BTreeMap;
 
 const PARTNER: &str = "[partner]\nkind = \"emulated-pressure\"\nemulated_gain = 0.8\ngain = 0.8\ngain_ci95 = 0.01\nlag_ms = 50.0\n";

@@ -1,6 +1,6 @@
 //! The ticks of a run as an evenly sampled record, and the segments in it.
 
-use crate::exciting::SETTLE_TICKS;
+use crate::experiment::exciting::SETTLE_TICKS;
 use cellpos_ident::experiment::{RecordedSegment, Span};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
 

@@ -5,8 +5,8 @@
 //! is not part of the loop, so the feedback biases nothing. To hold the bead the PZT undoes the partner's motion, so the gain in
 //! um of PZT does not depend on the plant's gain.
 
-use crate::on_rig::OnRig;
-use crate::rows::fix_noise_um;
+use crate::experiment::on_rig::OnRig;
+use crate::experiment::rows::fix_noise_um;
 use cellpos_control::Probe;
 use cellpos_ident::least_squares::{covariance, minimise};
 use cellpos_plant::{Model, Simulator};

@@ -3,12 +3,12 @@
 //!
 //! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
 
-use crate::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
-use crate::exciting::Handing;
-use crate::identify::held_bead::Setup;
-use crate::identify::led::{DelayTest, LitFrames};
-use crate::rows::{Rows, ended_spans, fix_noise_um};
-pub use crate::rows::{frame_age_ns, is_unseen};
+use crate::experiment::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
+use crate::experiment::exciting::Handing;
+use crate::experiment::identify::held_bead::Setup;
+use crate::experiment::identify::led::{DelayTest, LitFrames};
+use crate::experiment::rows::{Rows, ended_spans, fix_noise_um};
+pub use crate::experiment::rows::{frame_age_ns, is_unseen};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;

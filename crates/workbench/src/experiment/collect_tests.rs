@@ -1,11 +1,11 @@
 //! What `cellpos reconcile --collect` says of an emulated rig that hides one effect: values and intervals against the truth.
 //!
-//!     cargo test -p cellpos-experiment --lib table_of_hidden_effects -- --ignored --nocapture
+//!     cargo test -p cellpos-workbench --lib table_of_hidden_effects -- --ignored --nocapture
 //!
 //! `HIDDEN=leak` runs one row, `SEEDS=5` the seeds 1 to 5 (2 without it). The rig has all imperfections of a real one.
 
 use super::{Collecting, look};
-use crate::on_rig::OnRig;
+use crate::experiment::on_rig::OnRig;
 use cellpos_plant::Model;
 use cellpos_plant::effects::{self, Effect};
 use cellpos_reconcile::{Options, Reconciliation};

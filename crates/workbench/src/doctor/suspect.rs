@@ -4,7 +4,7 @@ use serde::Serialize;
 
 /// Something that ran while the loop was late.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct Suspect {
+pub struct Suspect {
     /// A process with its number, or an interrupt with its device.
     pub name: String,
     /// In how many of the late wake-ups, or late tenths of a second, it ran.
