@@ -33,6 +33,7 @@ mod fix;
 mod frame;
 mod joint;
 mod learn;
+mod left;
 mod level;
 mod lines;
 mod localiser;

@@ -13,10 +13,15 @@ use crate::template::Template;
 use nalgebra::{Matrix2, Vector2};
 
 /// Side of the patches over which what the template leaves counts as one, px and bead radii: noise that a camera, a codec
-/// or a blur has spread, and what sticks to a bead, are alike over some pixels.
+/// or a blur has spread, and what sticks to a bead, are alike over some pixels. In a narrow bead they are smaller, so that several of them
+/// tell the place: one that held the bead would have no score, for a fit has none.
 const PATCH: (f64, f64) = (5.0, 0.5);
-/// Share of even noise's variance that is left in a patch of values between the pixels.
+const LARGEST_PATCH_RADII: f64 = 0.8;
+/// Share of even noise's variance that is left in a patch of values between the pixels; of noise that neighbours have in common more is
+/// left, of one that all have, all.
 const INTERPOLATED: f64 = 0.83;
+/// Whole distances from a bead that a window holds.
+const RINGS: usize = 2 * STRIDE;
 /// Most patches in a window.
 const MAX_PATCHES: usize = 256;
 /// Share of a new fix in the running widening, and in a bead's running look.
@@ -29,7 +34,7 @@ const FEW_BEADS: usize = 12;
 
 /// Fixes of the bead itself that count as much as all others: a window's few patches tell a variance to half of it, beads of
 /// a recording differ by less.
-const POOLED_FIXES: f64 = 4.0;
+pub(crate) const POOLED_FIXES: f64 = 4.0;
 
 /// One vector a patch: what its pixels add to the score of the position, relative to the bead's contrast.
 type Scores = [[f32; 2]; MAX_PATCHES];
@@ -67,8 +72,9 @@ pub(crate) struct Residues {
     fixes: u64,
     /// What first and later fixes of all beads were widened by.
     pooled: [Pool; 2],
-    /// Room for what the template leaves of a window.
+    /// Room for what the template leaves of a window, and its mean at whole distances from the bead, px.
     pub left: Box<[Row; MAX_WINDOW_PX]>,
+    rings: Box<[f32; RINGS]>,
 }
 
 impl Residues {
@@ -78,6 +84,7 @@ impl Residues {
             fixes: 0,
             pooled: [Pool::default(); 2],
             left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
+            rings: Box::new([0.0; RINGS]),
         }
     }
 
@@ -101,6 +108,7 @@ impl Residues {
     ) -> Option<f64> {
         let half = crop.width.max(crop.height) / 2;
         let (scores, inverse) = self.scores(crop, template, comb, at, (amplitude, background))?;
+        let common = in_common(crop, self.left.as_slice());
         let relative = variance / (amplitude * amplitude);
         let reach_px = SAME_RADII * template.radius_px();
         let k = self.look(at, reach_px, half);
@@ -113,7 +121,8 @@ impl Residues {
         } else {
             1.0 + forgetting
         };
-        let now = widening_of(&scores, &look.mean, inverse, relative * own)?;
+        let kept = INTERPOLATED + (1.0 - INTERPOLATED) * common;
+        let now = widening_of(&scores, &look.mean, inverse, relative * own * kept)?;
         let pool = &mut self.pooled[usize::from(look.fixes > 0)];
         // One window has few patches: the mean over the last fixes is surer. The first says nothing of what stays.
         let share = (1.0 / known.max(1.0)).max(WIDENING_FORGETTING);
@@ -161,11 +170,49 @@ impl Residues {
     ) -> f64 {
         let middle = self.fill_left(crop, template, comb, at, (amplitude, background));
         let left = self.left.as_mut_slice();
-        take_off_radial_mean(crop, middle, left);
+        take_off_radial_mean(crop, middle, left, &mut self.rings);
         let rows = left.iter().take(crop.height);
         let square = |row: &Row| row.iter().take(crop.width).map(|v| v * v).sum::<f32>();
         let sum: f32 = rows.map(square).sum();
         f64::from(sum) / ((crop.width * crop.height) as f64)
+    }
+
+    /// Of what the last call of [`Residues::widening`] has left: its variance besides its mean all round where the place is read off,
+    /// grey^2, and how much the picture answers to a motion of the bead, over how much the template does. Of a blurred bead, whose
+    /// edges the template has steeper, it is less than 1, and the place is told worse by its square.
+    pub(crate) fn besides_the_mean(
+        &self,
+        crop: &Crop,
+        template: &Template,
+        comb: &Comb,
+        (x_px, y_px): (f64, f64),
+        amplitude: f64,
+    ) -> (f64, f64) {
+        let (x, y) = (
+            (x_px - crop.x0 as f64) as f32,
+            (y_px - crop.y0 as f64) as f32,
+        );
+        let mut image = Image::new(crop.lanes_end());
+        let (mut sum, mut weights, mut answer) = (0.0_f32, 0.0_f32, 0.0_f32);
+        for (j, left) in self.left.iter().enumerate().take(crop.height) {
+            let dy = j as f32 - y;
+            image.draw_row(template, comb, x, dy);
+            let derivatives = image.by_x.iter().zip(&image.by_y);
+            for (i, ((fx, fy), r)) in derivatives.zip(left).enumerate().take(crop.width) {
+                let dx = i as f32 - x;
+                let weight = fx * fx + fy * fy;
+                sum += weight * r * r;
+                weights += weight;
+                let away = f32::hypot(dx, dy).max(0.5);
+                let k = (away as usize).min(RINGS - 2);
+                // The derivative by the centre is the opposite of that by the place.
+                let slope = self.rings[k] - self.rings[k + 1];
+                answer += (fx * dx + fy * dy) / away * slope;
+            }
+        }
+        let weights = f64::from(weights.max(f32::MIN_POSITIVE));
+        let answers = 1.0 + f64::from(answer) / (amplitude * weights);
+        (f64::from(sum) / weights, answers)
     }
 
     /// Fills `left` with what the template leaves; the bead's place in the window.
@@ -223,7 +270,7 @@ impl Residues {
         let (x, y) = self.fill_left(crop, template, comb, (x_px, y_px), (amplitude, background));
         let (left, amplitude) = (self.left.as_mut_slice(), amplitude as f32);
         let mut image = Image::new(crop.width.next_multiple_of(LANES).min(STRIDE));
-        take_off_radial_mean(crop, (x, y), left);
+        take_off_radial_mean(crop, (x, y), left, &mut self.rings);
         // Points at whole distances from the centre: those opposite each other lie alike between the pixels.
         let reach = |c: f32, len: usize| c.min(len as f32 - 1.0 - c).floor().max(0.0) as usize;
         let (across, down) = (reach(x, crop.width), reach(y, crop.height));
@@ -245,10 +292,14 @@ impl Residues {
             );
             upper + b * (lower - upper)
         };
+        let radius_px = template.radius_px();
+        let patch = PATCH
+            .0
+            .min(LARGEST_PATCH_RADII * radius_px)
+            .max(PATCH.1 * radius_px);
         // Counted from the centre, so that a patch is the same part of the bead in every window.
         let half = crop.width.max(crop.height) / 2 + 1;
-        let side =
-            (PATCH.0.max(PATCH.1 * template.radius_px()) as usize).max((2 * half + 1).div_ceil(15));
+        let side = (patch as usize).max((2 * half + 1).div_ceil(15));
         let columns = (2 * half + 1).div_ceil(side);
         let mut patches = [[0.0; 2]; MAX_PATCHES];
         let mut information = Matrix2::zeros();
@@ -294,21 +345,39 @@ fn widening_of(
     }
     // Every patch has its opposite with the same score; the scores of a fit sum to zero, which takes some off.
     let effective = (sum.trace() / strongest.max(1e-24)).max(4.0);
-    let sum = sum * (2.0 / INTERPOLATED * effective / (effective - 1.5));
+    let sum = sum * (2.0 * effective / (effective - 1.5));
     let robust = inverse * sum * inverse;
     let ratio = robust.trace() / (inverse * variance).trace();
     ratio.is_finite().then_some(ratio)
 }
 
+/// Correlation of neighbours in a row of what is left, 0 to 1.
+fn in_common(crop: &Crop, left: &[Row]) -> f64 {
+    let (mut products, mut squares) = (0.0_f32, 0.0_f32);
+    for row in left.iter().take(crop.height) {
+        let row = row.get(..crop.width).unwrap_or(&[]);
+        for (a, b) in row.iter().zip(row.iter().skip(1)) {
+            products += a * b;
+            squares += 0.5 * (a * a + b * b);
+        }
+    }
+    f64::from(products / squares.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)
+}
+
 /// Takes the mean over each ring about the centre off what the template leaves: that of a template of another focus or size,
 /// which does not move the position.
-fn take_off_radial_mean(crop: &Crop, (x, y): (f32, f32), left: &mut [Row]) {
-    const RINGS: usize = 2 * STRIDE;
+fn take_off_radial_mean(
+    crop: &Crop,
+    (x, y): (f32, f32),
+    left: &mut [Row],
+    sums: &mut [f32; RINGS],
+) {
     let place = |i: usize, j: usize| {
         let u = f32::hypot(i as f32 - x, j as f32 - y);
         (u as usize, u.fract())
     };
-    let (mut sums, mut weights) = ([0.0_f32; RINGS], [0.0_f32; RINGS]);
+    *sums = [0.0; RINGS];
+    let mut weights = [0.0_f32; RINGS];
     for (j, row) in left.iter().enumerate().take(crop.height) {
         for (i, v) in row.iter().enumerate().take(crop.width) {
             let (k, t) = place(i, j);

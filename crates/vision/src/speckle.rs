@@ -8,13 +8,14 @@ use crate::crop::{Crop, Row};
 
 /// A speck differs by so many standard deviations of the noise at least: of 10,000 pixels, noise makes one in 50,000 frames.
 pub(crate) const LEAST_SIGMA: f32 = 6.0;
-/// ... and by so many times as its neighbours among themselves. The sharpest image of a point, a Gaussian of 0.7 px on the
+/// The same once the bead is fitted. Noise makes one of 150,000 pixels so strong, and to leave that one out costs next to nothing; where one
+/// pixel in a thousand is hot, most that are so strong are.
+pub(crate) const LEAST_LEFT_SIGMA: f32 = 4.5;
+/// A speck differs by so many times as its neighbours among themselves. The sharpest image of a point, a Gaussian of 0.7 px on the
 /// middle of a pixel, differs by 3.3 times.
 const LEAST_SPREADS: f32 = 4.0;
 /// Largest share of a speck that its neighbours have on average. They have 0.36 of that sharpest image.
 const MOST_SHARED: f32 = 0.25;
-/// Largest share of a speck that is left on the other side of the bead's centre: interpolation makes it uncertain by less.
-const MOST_OPPOSITE: f32 = 0.5;
 
 /// What a pixel should be if it is a speck among its eight neighbours: their mean without the two extremes.
 pub(crate) fn replacement(value: f32, mut near: [f32; 8], noise: f32) -> Option<f32> {
@@ -106,48 +107,27 @@ pub(crate) fn clean(crop: &mut Crop, noise: f32) -> usize {
 
 /// Leaves the specks that a fit shows out of the next fits in the window: the strongest, and those half as strong. A fit
 /// that a strong speck has drawn off shows others that are none.
-/// `left` is what the fit leaves, `strongest` its largest; `tolerance` is the share of the bead's own light that the template
-/// may be wrong by. Returns how many there are.
+/// `left` is what the fit leaves, `strongest` its largest. What the fit leaves of the bead's other pixels says by how much of its
+/// light the template is wrong. Returns how many there are.
 pub(crate) fn leave_out(
     crop: &mut Crop,
-    (x_px, y_px): (f64, f64),
     background: f64,
-    (noise, tolerance): (f32, f32),
+    noise: f32,
     left: &[Row],
     strongest: f32,
 ) -> usize {
     let background = background as f32;
-    let (x, y) = (
-        (x_px - crop.x0 as f64) as f32,
-        (y_px - crop.y0 as f64) as f32,
-    );
-    let least = LEAST_SIGMA * noise;
+    let least = LEAST_LEFT_SIGMA * noise;
     if strongest <= least {
         return 0;
     }
     let get = |j: usize, i: usize| left.get(j)?.get(i).copied();
-    // What is left on the other side of the centre, between the pixels.
-    let (width, height) = (crop.width, crop.height);
-    let opposite = |j: usize, i: usize| {
-        let (u, v) = ((2.0 * x - i as f32).max(0.0), (2.0 * y - j as f32).max(0.0));
-        let (k, l) = (u as usize, v as usize);
-        let (a, b) = (u - k as f32, v - l as f32);
-        let at = |l, k| {
-            if k < width && l < height {
-                get(l, k).unwrap_or(0.0)
-            } else {
-                0.0
-            }
-        };
-        let upper = at(l, k) + a * (at(l, k + 1) - at(l, k));
-        let lower = at(l + 1, k) + a * (at(l + 1, k + 1) - at(l + 1, k));
-        upper + b * (lower - upper)
-    };
     let mut threshold = least;
     let mut found = 0;
     // The strongest that is a speck first; then those half as strong.
     for look in 0..2 {
         let mut most = 0.0_f32;
+        let wrong = Wrong::of(crop, background, noise, left);
         for j in 0..crop.height {
             for i in 0..crop.width {
                 let Some(own) = get(j, i).filter(|own| own.abs() > threshold) else {
@@ -160,10 +140,7 @@ pub(crate) fn leave_out(
                     (j, i + 1),
                 ];
                 // A template of another size is wrong where the bead is steep: by its light next to the pixel.
-                let bead = |j: usize, i: usize| {
-                    let light = crop.rows.get(j).and_then(|row| row.get(i))? - background;
-                    Some((light - get(j, i)?).abs())
-                };
+                let bead = |j: usize, i: usize| Some(light(crop, background, (j, i), get(j, i)?));
                 let (mut sum, mut n) = (0.0_f32, 0.0_f32);
                 let mut light = bead(j, i).unwrap_or(0.0);
                 for (j, i) in near {
@@ -174,11 +151,7 @@ pub(crate) fn leave_out(
                     }
                 }
                 let shared = sum / n.max(1.0) * own.signum() > MOST_SHARED * own.abs();
-                if shared || own.abs() <= least + tolerance * light {
-                    continue;
-                }
-                // A template of another focus is wrong on both sides alike, and a speck in the very middle moves nothing.
-                if opposite(j, i) * own.signum() > MOST_OPPOSITE * own.abs() {
+                if shared || own.abs() <= LEAST_SPREADS * wrong.without(own, light) {
                     continue;
                 }
                 most = most.max(own.abs());
@@ -193,6 +166,52 @@ pub(crate) fn leave_out(
         }
     }
     found
+}
+
+/// The bead's own light in a pixel, of which a fit leaves `left`.
+fn light(crop: &Crop, background: f32, (j, i): (usize, usize), left: f32) -> f32 {
+    let grey = crop.rows.get(j).and_then(|row| row.get(i));
+    grey.map_or(0.0, |grey| (grey - background - left).abs())
+}
+
+/// How far the template is wrong by a share of the bead's light, as what it leaves beyond noise says.
+struct Wrong {
+    /// Sums over the window, weighted with the light's square: what is left, squared, beyond noise; and the light's square.
+    excess: f32,
+    squares: f32,
+    noise: f32,
+}
+
+impl Wrong {
+    fn of(crop: &Crop, background: f32, noise: f32, left: &[Row]) -> Self {
+        let (mut excess, mut squares) = (0.0_f32, 0.0_f32);
+        for (j, row) in left.iter().enumerate().take(crop.height) {
+            for (i, own) in row.iter().enumerate().take(crop.width) {
+                let light = light(crop, background, (j, i), *own);
+                let weight = light * light;
+                excess += weight * (own * own - noise * noise);
+                squares += weight * weight;
+            }
+        }
+        Wrong {
+            excess,
+            squares,
+            noise,
+        }
+    }
+
+    /// Standard deviation of what is left of a pixel with some light, judged by all but the pixel itself.
+    fn without(&self, own: f32, light: f32) -> f32 {
+        let weight = light * light;
+        let excess = self.excess - weight * (own * own - self.noise * self.noise);
+        let squares = self.squares - weight * weight;
+        let share = if squares > 0.0 {
+            (excess / squares).max(0.0)
+        } else {
+            0.0
+        };
+        (self.noise * self.noise + share * weight).sqrt()
+    }
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 //! Taking off what was fitted and fitting again converges to the fit of all beads together, at the price of single fits.
 
 use super::Localiser;
-use super::others::Others;
+use super::view::{Others, View};
 use crate::fit::Image;
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
@@ -35,9 +35,11 @@ impl Localiser {
                 .clone()
                 .enumerate()
                 .all(|(m, (u, v))| m == n || f64::hypot(u - x, v - y) > reach_px);
-            self.drafts = !alone;
-            let fix = self.locate(frame, Some((x, y)));
-            self.drafts = false;
+            let view = View {
+                is_draft: !alone,
+                ..View::of(frame)
+            };
+            let fix = self.locate_in(&view, (x, y));
             let apart = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) >= radius_px;
             if fixes.iter().all(apart) {
                 fixes.push(fix);
@@ -66,11 +68,12 @@ impl Localiser {
                     .filter(is_bead)
                     .filter(|f| near(f))
                     .for_each(|f| others.add(f));
-                self.others = others;
-                self.drafts = round < ROUNDS;
-                let fix = self.locate(frame, Some((own.x_px, own.y_px)));
-                self.others = Others::default();
-                self.drafts = false;
+                let view = View {
+                    others,
+                    is_draft: round < ROUNDS,
+                    ..View::of(frame)
+                };
+                let fix = self.locate_in(&view, (own.x_px, own.y_px));
                 let off_px = f64::hypot(fix.x_px - own.x_px, fix.y_px - own.y_px);
                 if off_px < radius_px || round == ROUNDS {
                     fixes[k] = fix;
@@ -90,17 +93,11 @@ impl Localiser {
     }
 
     /// Copies a window, without the neighbours' images.
-    pub(super) fn take_crop(
-        &mut self,
-        frame: &Frame,
-        x_px: f64,
-        y_px: f64,
-        side_px: usize,
-    ) -> bool {
-        if !self.crop.take(frame, x_px, y_px, side_px) {
+    pub(super) fn take_crop(&mut self, view: &View, x_px: f64, y_px: f64, side_px: usize) -> bool {
+        if !self.crop.take(view.frame, x_px, y_px, side_px) {
             return false;
         }
-        for (x_px, y_px, contrast) in self.others.beads() {
+        for (x_px, y_px, contrast) in view.others.beads() {
             let lanes_end = self.crop.lanes_end();
             let mut image = Image::new(lanes_end);
             let x = (x_px - self.crop.x0 as f64) as f32;

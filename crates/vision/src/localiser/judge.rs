@@ -2,11 +2,12 @@
 
 use super::certainty::LEAST_SIGNIFICANCE;
 use super::{Fitted, Localiser, NARROW_RADII};
-use crate::beyond::Left;
 use crate::config::PixelNoise;
 use crate::fit::Weights;
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
+use crate::left::Left;
+use crate::residue::POOLED_FIXES;
 use crate::template::Template;
 
 /// Residual ratio from which the variance is judged by the residual: noise alone does not reach it; and the same of the pixels
@@ -16,9 +17,12 @@ const WIDENED_LOCALLY: f64 = 1.2;
 /// Mean square of the measured ring about its mean in its window of 25 px (`the_measured_bead_fills_its_window...`).
 const MEASURED: f64 = 0.135;
 
-/// Radius of a bead that is narrower than the smallest patch, of 5 px: patches do not resolve it, and what the template leaves where
-/// the place is read off counts in full.
+/// Radius of a bead that patches of whole pixels do not resolve: what the template leaves in the pixels where the place is read off counts.
 const UNRESOLVED_PX: f64 = 2.5;
+/// Square of the least answer of a picture to a motion of the bead, over the template's: below, noise decides.
+const LEAST_ANSWER: f64 = 0.04;
+/// Share of fixes that something spoils which spoils no others, before the window is looked at.
+const SPOILT: f64 = 0.01;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
 const LEAST_EXPLAINED: f64 = 0.5;
 
@@ -158,32 +162,76 @@ impl Localiser {
             self.narrow(fix);
             self.add_lines(fix, left);
         }
-        if fix.residual_ratio <= WIDENED_RATIO && self.local.mean <= WIDENED_LOCALLY {
-            return 1.0;
-        }
-        let widening = self.residues.widening(
-            &self.crop,
-            &self.template,
-            &self.comb,
-            (fix.x_px, fix.y_px),
-            (
-                fix.amplitude,
-                fix.background - f64::from(self.crop.pedestal),
-            ),
-            self.pixel_variance(fix.background),
-        );
-        let mut widening = widening.unwrap_or(fix.residual_ratio).max(1.0);
-        let radius_px = self.template.radius_px();
-        if radius_px < UNRESOLVED_PX {
-            // Four parameters take their part of the few pixels that tell the place.
-            let pixels = (core::f64::consts::PI * radius_px * radius_px).max(8.0);
-            let left = left.local_variance * pixels / (pixels - 4.0);
-            widening = widening.max(left / self.pixel_variance(fix.background));
-        }
+        let more = fix.residual_ratio > WIDENED_RATIO || self.local.mean > WIDENED_LOCALLY;
+        let widening = if more {
+            self.widening_by_what_is_left(fix)
+        } else {
+            self.widening_by_pixels(
+                left.local_variance / self.pixel_variance(fix.background),
+                0.0,
+            )
+        };
         fix.var_x_px2 *= widening;
         fix.var_y_px2 *= widening;
         fix.cov_xy_px2 *= widening;
         widening
+    }
+
+    /// The same where it leaves more than noise: what patches and pixels leave besides their mean all round. That mean tells how
+    /// much steeper the template is than the bead.
+    fn widening_by_what_is_left(&mut self, fix: &Fix) -> f64 {
+        let at = (fix.x_px, fix.y_px);
+        let background = fix.background - f64::from(self.crop.pedestal);
+        let variance = self.pixel_variance(fix.background);
+        let by_patches = self.residues.widening(
+            &self.crop,
+            &self.template,
+            &self.comb,
+            at,
+            (fix.amplitude, background),
+            variance,
+        );
+        let by_patches = by_patches.unwrap_or(fix.residual_ratio).max(1.0);
+        let (local, answers) = self.residues.besides_the_mean(
+            &self.crop,
+            &self.template,
+            &self.comb,
+            at,
+            fix.amplitude,
+        );
+        // A ring's mean takes a part of its pixels: two thirds of one of 2 pi r, at half the radius.
+        let by_rings = 2.0 / 3.0 * self.template.radius_px();
+        let by_pixels = self.widening_by_pixels(local / variance, by_rings);
+        // One window tells it with noise; the last fixes have been in a like focus.
+        let answers = self.answers.shrink(answers, 1.0, POOLED_FIXES);
+        by_pixels.max(by_patches) / (answers * answers).max(LEAST_ANSWER)
+    }
+
+    /// What the pixels that tell the place leave, over noise. Of a narrow bead they are few: their variance is that of the last
+    /// fixes, or this fix is spoilt, and it is their own. The posterior of the two weights them. Of a wide bead patches say more.
+    /// `taken` is what was fitted besides place and contrast, in pixels.
+    fn widening_by_pixels(&mut self, left: f64, taken: f64) -> f64 {
+        let radius_px = self.template.radius_px();
+        // Of a Gaussian, exactly: the square of the sum of the squared derivatives, over the sum of their squares. Place and
+        // contrast take their part.
+        let pixels = (core::f64::consts::PI * radius_px * radius_px).max(8.0);
+        let freedom = pixels - 3.0 - taken;
+        let own = left * pixels / freedom;
+        if self.comb.is_still() {
+            self.local.take_in(own);
+        }
+        if radius_px >= UNRESOLVED_PX {
+            return 1.0;
+        }
+        let usual = self.local.mean.max(1.0);
+        let ratio = (own / usual).max(1.0);
+        let odds = SPOILT * (0.5 * freedom * (ratio - 1.0 - ratio.ln())).exp();
+        let spoilt = if odds.is_finite() {
+            odds / (1.0 + odds)
+        } else {
+            1.0
+        };
+        usual + spoilt * (ratio - 1.0) * usual
     }
 
     /// Part of the whole window that the bead fills, for the tolerance of a template's error: see [`filled`].

@@ -4,26 +4,26 @@ mod among;
 mod certainty;
 mod judge;
 mod noise;
-mod others;
 mod refine;
 mod together;
+mod view;
 
 pub use together::{Start, Together};
 
-use crate::beyond::Left;
 use crate::config::{ConfigError, LocaliserConfig};
 use crate::crop::Crop;
 use crate::fit::{self, Pass};
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
+use crate::left::Left;
 use crate::pool::Pool;
 use crate::residue::Residues;
 use crate::seed;
 use crate::speckle;
 use crate::streak::Comb;
 use crate::template::Template;
-use others::Others;
+use view::View;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
 const CONVERGED_PX: f64 = 0.01;
@@ -61,12 +61,8 @@ pub struct Localiser {
     residues: Residues,
     /// Whether specks that show without knowing the bead are replaced in the windows of this fix.
     cleans: bool,
-    /// Whether a residual that is the same all round counts as none, and how much of what may be lopsided was in the last one asked.
-    pardons: bool,
+    /// How much of what may be lopsided was in the last fit that was asked.
     lopsided: f64,
-    /// Beads whose images are taken off the windows of this fix, and whether this fix is one of those on the way to a better one.
-    others: Others,
-    drafts: bool,
     /// What light that falls unevenly on the bead moves it by: see [`judge::shading_px2`].
     shading_px2: f64,
     /// How much of a window the bead fills: the whole window, and the narrow one.
@@ -77,6 +73,8 @@ pub struct Localiser {
     /// What the last fixes were widened by, and their residual ratios.
     widened: Pool,
     ratio: Pool,
+    /// How much the pictures of beads that the template fits badly answer to a motion: see [`Residues::besides_the_mean`].
+    answers: Pool,
 }
 
 /// A fit at rest or given up.
@@ -115,16 +113,14 @@ impl Localiser {
             comb: Comb::STILL,
             residues: Residues::new(),
             cleans: false,
-            pardons: false,
             lopsided: 0.0,
-            others: Others::default(),
-            drafts: false,
             shading_px2,
             filled,
             local: Pool::default(),
             lines: [Pool::default(); 2],
             widened: Pool::default(),
             ratio: Pool::default(),
+            answers: Pool::default(),
         })
     }
 
@@ -179,9 +175,15 @@ impl Localiser {
         let Some((x_px, y_px)) = start else {
             return Fix::none(0.0, 0.0, FixQuality::NoSignal);
         };
+        self.locate_in(&View::of(frame), (x_px, y_px))
+    }
+
+    /// Position of the bead nearest to a place (px).
+    fn locate_in(&mut self, view: &View, (x_px, y_px): (f64, f64)) -> Fix {
+        let radius_px = self.template.radius_px();
         let window_px = self.config.window_px;
-        let fix = self.attempt(frame, (x_px, y_px), window_px);
-        if fix.verdict == FixQuality::Good && !self.drafts {
+        let fix = self.attempt(view, (x_px, y_px), window_px);
+        if fix.verdict == FixQuality::Good && !view.is_draft {
             self.learn(&fix);
         }
         if matches!(fix.verdict, FixQuality::Good | FixQuality::AtBorder) {
@@ -190,28 +192,30 @@ impl Localiser {
         // A neighbour may have come into the window's corner: once more with a window that just holds the bead.
         let narrow_px = 2 * (NARROW_RADII * radius_px).ceil() as usize + 1;
         if narrow_px < window_px {
-            let again = self.attempt(frame, (x_px, y_px), narrow_px);
+            let again = self.attempt(view, (x_px, y_px), narrow_px);
             if again.verdict == FixQuality::Good {
                 return again;
             }
         }
         // It may be out of focus, or blurred.
         if fix.verdict == FixQuality::BadFit {
-            self.pardons = true;
-            let again = self.attempt(frame, (x_px, y_px), window_px);
-            self.pardons = false;
+            let pardoning = View {
+                pardons: true,
+                ..*view
+            };
+            let again = self.attempt(&pardoning, (x_px, y_px), window_px);
             if again.verdict == FixQuality::Good {
                 return again;
             }
         }
         // The guess may have been out of the fit's reach: once more from the centroid.
-        if !self.take_crop(frame, x_px, y_px, window_px) {
+        if !self.take_crop(view, x_px, y_px, window_px) {
             return fix;
         }
         let Some(centroid) = self.crop.centroid(self.sign as f32, radius_px) else {
             return fix;
         };
-        let again = self.attempt(frame, centroid, window_px);
+        let again = self.attempt(view, centroid, window_px);
         if matches!(again.verdict, FixQuality::Good | FixQuality::AtBorder) {
             again
         } else {
@@ -233,8 +237,8 @@ impl Localiser {
     }
 
     /// Copies a window.
-    fn take_window(&mut self, frame: &Frame, x_px: f64, y_px: f64, side_px: usize) -> bool {
-        let taken = self.take_crop(frame, x_px, y_px, side_px);
+    fn take_window(&mut self, view: &View, x_px: f64, y_px: f64, side_px: usize) -> bool {
+        let taken = self.take_crop(view, x_px, y_px, side_px);
         if taken
             && self.cleans
             && let Some(variance) = self.noise_variance
@@ -244,12 +248,12 @@ impl Localiser {
         taken
     }
 
-    fn attempt(&mut self, frame: &Frame, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
+    fn attempt(&mut self, view: &View, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
         self.comb = Comb::new(self.streak_px, self.template.radius_px());
         self.template.stretch_to(1.0);
         self.cleans = false;
         self.lopsided = 0.0;
-        if !self.take_window(frame, x_px, y_px, side_px) {
+        if !self.take_window(view, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, FixQuality::AtBorder);
         }
         // The noise is read off the border of a whole window that holds one bead in its middle; anywhere else edges
@@ -257,18 +261,18 @@ impl Localiser {
         if self.noise_variance.is_none() {
             self.update_noise();
         }
-        let mut fitted = self.fit(frame, (x_px, y_px), side_px, MAX_RECENTRES);
+        let mut fitted = self.fit(view, (x_px, y_px), side_px, MAX_RECENTRES);
         if !self.comb.is_still() {
-            fitted = self.fit_length(frame, fitted, side_px);
+            fitted = self.fit_length(view, fitted, side_px);
         }
-        let fitted = self.refine(frame, fitted, (x_px, y_px), side_px);
+        let fitted = self.refine(view, fitted, (x_px, y_px), side_px);
         let found = fitted.as_ref().map(|f| f.pass);
         let left = fitted.as_ref().map_or(Left::default(), |f| f.left);
-        let mut fix = self.judge(frame, fitted, (x_px, y_px));
-        if fix.verdict == FixQuality::BadFit && self.pardons {
-            self.pardon(frame, &mut fix);
+        let mut fix = self.judge(view.frame, fitted, (x_px, y_px));
+        if fix.verdict == FixQuality::BadFit && view.pardons {
+            self.pardon(view.frame, &mut fix);
         }
-        if self.drafts {
+        if view.is_draft {
             return fix;
         }
         let widening = self.widen(&mut fix, &left);
@@ -276,6 +280,10 @@ impl Localiser {
             && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
         {
             fix.verdict = FixQuality::NoSignal;
+        }
+        let variance = self.pixel_variance(fix.background) * widening;
+        if fix.verdict == FixQuality::Good && self.comb.is_still() && left.has_rival(variance) {
+            fix.verdict = FixQuality::BadFit;
         }
         if let Some(pass) = found.filter(|_| fix.verdict == FixQuality::Good) {
             let variance = self.weight_unit() * widening * pass.amplitude_variance;
@@ -293,12 +301,7 @@ impl Localiser {
 
     /// Refines the length of a streak beside the position. By symmetry the two do not depend on each other, so that they
     /// are fitted in turn.
-    fn fit_length(
-        &mut self,
-        frame: &Frame,
-        first: Option<Fitted>,
-        side_px: usize,
-    ) -> Option<Fitted> {
+    fn fit_length(&mut self, view: &View, first: Option<Fitted>, side_px: usize) -> Option<Fitted> {
         let (mut fitted, mut factor) = (first?, 1.0);
         for _ in 0..STRETCHES {
             let bead = [(fitted.x_px, fitted.y_px, 1.0)];
@@ -306,7 +309,7 @@ impl Localiser {
                 break;
             };
             factor = better;
-            fitted = self.fit(frame, (fitted.x_px, fitted.y_px), side_px, MAX_RECENTRES)?;
+            fitted = self.fit(view, (fitted.x_px, fitted.y_px), side_px, MAX_RECENTRES)?;
         }
         Some(fitted)
     }
@@ -356,7 +359,7 @@ impl Localiser {
 
     fn fit(
         &mut self,
-        frame: &Frame,
+        view: &View,
         (x_px, y_px): (f64, f64),
         side_px: usize,
         max_recentres: u32,
@@ -392,7 +395,7 @@ impl Localiser {
             );
             if off_centre > RECENTRE_PX && recentres < max_recentres {
                 let (x0, y0) = (self.crop.x0, self.crop.y0);
-                if !self.take_window(frame, x_px, y_px, side_px) {
+                if !self.take_window(view, x_px, y_px, side_px) {
                     return Some(Fitted {
                         x_px,
                         y_px,

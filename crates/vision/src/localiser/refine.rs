@@ -1,10 +1,11 @@
 //! What comes after the first fit: specks are left out, and rising light and another focus are fitted where the window asks.
 
 use super::judge::WIDENED_RATIO;
+use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
-use crate::beyond::{self, Left};
+use crate::beyond;
 use crate::fix::Fix;
-use crate::frame::Frame;
+use crate::left::{self, Left};
 use crate::speckle;
 
 /// How often specks are looked for in what a fit leaves: each time those half as strong as the strongest are left out.
@@ -17,7 +18,7 @@ impl Localiser {
     /// The fit without specks, with the light's slope and the size where a test finds them.
     pub(super) fn refine(
         &mut self,
-        frame: &Frame,
+        view: &View,
         first: Option<Fitted>,
         guess: (f64, f64),
         side_px: usize,
@@ -25,15 +26,15 @@ impl Localiser {
         let mut fitted = first;
         let mut left = fitted.as_ref().map(|f| self.left_by(f));
         let noise = self.noise_variance.unwrap_or(1.0).sqrt() as f32;
-        if left.is_none_or(|l| l.strongest > speckle::LEAST_SIGMA * noise) {
+        if left.is_none_or(|l| l.strongest > speckle::LEAST_LEFT_SIGMA * noise) {
             // A speck may have drawn the fit to itself: those that show without the bead go first, in every window.
             self.cleans = true;
             if speckle::clean(&mut self.crop, noise) > 0
-                && self.take_window(frame, guess.0, guess.1, side_px)
+                && self.take_window(view, guess.0, guess.1, side_px)
             {
-                fitted = self.fit(frame, guess, side_px, MAX_RECENTRES);
+                fitted = self.fit(view, guess, side_px, MAX_RECENTRES);
                 if !self.comb.is_still() {
-                    fitted = self.fit_length(frame, fitted, side_px);
+                    fitted = self.fit_length(view, fitted, side_px);
                 }
                 left = fitted.as_ref().map(|f| self.left_by(f));
             }
@@ -43,13 +44,11 @@ impl Localiser {
             let brightest =
                 f.pass.background + f.pass.amplitude.max(0.0) + f64::from(self.crop.pedestal);
             let noise = self.pixel_variance(brightest).sqrt() as f32;
-            let tolerance = self.template_tolerance() as f32;
             let (at, background) = ((f.x_px, f.y_px), f.pass.background);
             let found = speckle::leave_out(
                 &mut self.crop,
-                at,
                 background,
-                (noise, tolerance),
+                noise,
                 self.residues.left.as_slice(),
                 l.strongest,
             );
@@ -57,7 +56,7 @@ impl Localiser {
                 break;
             }
             // The window stays: a new one would have the specks again.
-            fitted = self.fit(frame, at, side_px, 0);
+            fitted = self.fit(view, at, side_px, 0);
             left = fitted.as_ref().map(|f| self.left_by(f));
         }
         let (f, l) = (
@@ -108,7 +107,6 @@ impl Localiser {
     /// Widens a good fix's covariance by the offsets that rows and columns have had in the last fixes, and takes in this one's.
     pub(super) fn add_lines(&mut self, fix: &mut Fix, left: &Left) {
         let variance = self.pixel_variance(fix.background);
-        self.local.take_in(left.local_variance / variance);
         let excess = left.lines.map(|lines| lines.excess(variance));
         // What a template leaves differs from line to line, too, but by little of all that it leaves.
         let beyond_noise = (fix.residual_ratio - 1.0) * variance;
@@ -126,7 +124,7 @@ impl Localiser {
 
     /// What a fit leaves of the window.
     fn left_by(&mut self, f: &Fitted) -> Left {
-        beyond::examine(
+        left::examine(
             &self.crop,
             &self.template,
             &self.comb,

@@ -126,7 +126,10 @@ fn ratio(spoilt: Spoilt) -> (f64, f64) {
     let mut localiser = Localiser::new(config).unwrap();
     let (mut error2, mut stated2) = (0.0, 0.0);
     // So many frames show the ratio to 3 %; where it is near a bound, to 1 %, so that chance does not decide.
-    let near_bound = matches!(spoilt, Spoilt::Blurred(1.5) | Spoilt::Saturated(160.0));
+    let near_bound = matches!(
+        spoilt,
+        Spoilt::Blurred(1.5) | Spoilt::Saturated(160.0) | Spoilt::Compressed(20.0)
+    );
     let count = if near_bound { 2500 } else { 300 };
     for _ in 0..count {
         let at = (31.0 + random.uniform(), 31.0 + random.uniform());
