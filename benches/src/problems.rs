@@ -22,7 +22,7 @@ impl ControlLaw for Keeping {
     }
 
     fn step(&self, state: &mut MpcState, input: &LawInput) -> LawOutput {
-        let problem = self.law.problem(state, input);
+        let problem = self.law.problem(input);
         self.kept
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
@@ -40,10 +40,6 @@ impl ControlLaw for Keeping {
 
     fn preview_len(&self) -> usize {
         self.law.preview_len()
-    }
-
-    fn feeds_forward(&self) -> bool {
-        true
     }
 }
 

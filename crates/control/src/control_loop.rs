@@ -2,10 +2,12 @@
 
 use crate::error::BuildError;
 use crate::estimator::{Estimate, Estimator, EstimatorState, Fix};
+use crate::feedforward::FeedForwardState;
 use crate::law::{ControlLaw, FAR_UM, LawInput, LawOutput};
 use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
+use crate::path::{Path, PathState};
 use crate::plant_estimate::{AdaptState, Adaptation, Adapter, TickOutcome};
 use crate::tuning::Tuning;
 
@@ -22,6 +24,8 @@ pub struct LoopState<S> {
     pub hidden_um: f64,
     /// Feed-forward of the previous tick, um from neutral in the units of the law.
     pub forward_um: f64,
+    /// Path of the reference.
+    pub path: PathState,
     /// Estimate of the plant and the tuning in force, where the loop adapts.
     pub adapt: Option<AdaptState>,
 }
@@ -46,6 +50,7 @@ pub struct LoopState<S> {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ControlLoop<L> {
     parts: LoopParts<L>,
+    path: Path,
     estimator: Estimator,
     adapter: Option<Adapter>,
 }
@@ -71,10 +76,11 @@ impl<L: ControlLaw> ControlLoop<L> {
         let (config, model) = (parts.estimator, parts.model);
         let adapter = config
             .adapt
-            .then(|| Adapter::new(config, model, parts.controller.feeds_forward()))
+            .then(|| Adapter::new(config, model))
             .transpose()?;
         Ok(Self {
             estimator: Estimator::new(config, model)?,
+            path: Path::new(&model, &parts.limits),
             adapter,
             parts,
         })
@@ -104,6 +110,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             previous_um: command,
             hidden_um: 0.0,
             forward_um: 0.0,
+            path: PathState::default(),
             adapt: self.adapter.map(|adapter| adapter.start(command)),
         }
     }
@@ -194,7 +201,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         self.shift(state, input.zero_flow_shift_um);
         let tick = self.estimate(state, input);
         let gain = tick.law.tuning.gain;
-        let decided = if tick.controls {
+        let mut decided = if tick.controls {
             law.step(&mut state.law, &tick.law)
         } else {
             LawOutput::wish(match input.mode {
@@ -203,7 +210,10 @@ impl<L: ControlLaw> ControlLoop<L> {
                 Mode::Run | Mode::Freeze => tick.law.estimate.neutral_um,
             })
         };
-        let driven = driven(input, &tick, &decided);
+        let driven = driven(input, &tick);
+        // What the law asks for on its own.
+        let own_um = decided.wish_um;
+        decided.wish_um += driven.feed_forward_um;
         // The part that cancels a line in the flow is hidden from the estimator like the learned part: the bead shows neither.
         let cancel_um = match (&self.adapter, &state.adapt) {
             (Some(adapter), Some(adapt)) if tick.controls => adapter.cancel_um(adapt),
@@ -235,15 +245,15 @@ impl<L: ControlLaw> ControlLoop<L> {
         if tick.controls {
             // The excitation is no saturation: an integrator must not be pulled along with it.
             // Nor does what never reached the actuator wind it up.
-            let applied_um = stood_um.unwrap_or(output.command_um - added_um) * gain;
-            law.applied(&mut state.law, &tick.law, decided.wish_um, applied_um);
+            let stood_um = stood_um.unwrap_or(output.command_um - added_um) * gain;
+            let applied_um = stood_um - driven.feed_forward_um;
+            law.applied(&mut state.law, &tick.law, own_um, applied_um);
         } else {
             law.follow(&mut state.law, &tick.law, output.command_um * gain);
         }
-        // With a feed-forward of its own the loop asks for what moves the model along the reference; what is learned makes
-        // the bead do the same, so the estimator is not told of it. Without one the learned part is what moves the bead,
-        // and an estimator that does not know of it refuses fixes and takes the bead for stuck.
-        let hidden_um = if law.feeds_forward() { learned_um } else { 0.0 };
+        // The feed-forward moves the model along the reference; what is learned makes the bead do the same, so the estimator is not
+        // told of it.
+        let hidden_um = learned_um;
         self.estimator
             .push(&mut state.estimator, (output.command_um - hidden_um) * gain);
         state.previous_um = output.command_um;
@@ -356,23 +366,38 @@ impl<L: ControlLaw> ControlLoop<L> {
             _ => estimate.predicted_measurement_um,
         } - dithered_um;
         let reference_ok = input.reference_um.abs() < FAR_UM;
+        let controls = input.mode == Mode::Run && reference_ok && estimate.seen;
+        let mut law = LawInput {
+            reference_um: if reference_ok {
+                input.reference_um
+            } else {
+                bead_um
+            },
+            preview_um: input.preview_um,
+            bead_um,
+            fed_um: 0.0,
+            on_path: FeedForwardState::default(),
+            feed_forward_um: 0.0,
+            estimate,
+            previous_um: (state.previous_um - state.hidden_um) * tuning.gain,
+            tuning,
+            solver: input.solver,
+        };
+        if controls {
+            let offset = (fix.as_ref().filter(|_| estimate.fresh)).map_or(0.0, |fix| fix.offset);
+            let model = self.estimator_of(state).model();
+            let exposure_ticks = self.parts.estimator.exposure_ms * 1e-3 / model.sample_time_s;
+            let age_ticks = model.delay_samples() + offset;
+            self.path
+                .meet(&mut state.path, &mut law, age_ticks, exposure_ticks);
+        } else {
+            Path::rest(&mut state.path, law.reference_um);
+        }
         Tick {
-            controls: input.mode == Mode::Run && reference_ok && estimate.seen,
+            controls,
             fix,
             not_finite: !reference_ok || (input.measurement.is_some() && fix.is_none()),
-            law: LawInput {
-                reference_um: if reference_ok {
-                    input.reference_um
-                } else {
-                    bead_um
-                },
-                preview_um: input.preview_um,
-                bead_um,
-                estimate,
-                previous_um: (state.previous_um - state.hidden_um) * tuning.gain,
-                tuning,
-                solver: input.solver,
-            },
+            law,
         }
     }
 
@@ -426,15 +451,11 @@ impl<L: ControlLaw> ControlLoop<L> {
 }
 
 /// What moves the bead along the reference in a tick.
-fn driven(input: &LoopInput, tick: &Tick, decided: &LawOutput) -> Driven {
+fn driven(input: &LoopInput, tick: &Tick) -> Driven {
     let gain = tick.law.tuning.gain;
     let asked = input.feed_forward_gain;
     Driven {
-        feed_forward_um: if tick.controls {
-            decided.feed_forward_um
-        } else {
-            0.0
-        },
+        feed_forward_um: tick.law.feed_forward_um,
         jump_um: 0.0,
         feed_forward_gain: asked
             .filter(|gain| (0.1..=10.0).contains(gain))

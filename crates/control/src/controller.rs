@@ -3,6 +3,7 @@
 use crate::control_loop::{ControlLoop, LoopState};
 use crate::error::BuildError;
 use crate::estimator::{EstimatorConfig, EstimatorState};
+use crate::feedforward::BRAKING_TICKS;
 use crate::law::{ControlLaw, LAW_COLUMNS};
 use crate::linear::LinearLaw;
 use crate::loop_io::{LoopInput, LoopOutput, LoopParts};
@@ -132,7 +133,7 @@ impl Controller {
                 Self::with_law(config.with(PiLaw::new(pi, model.sample_time_s)?))
             }
             ControllerConfig::Lqg(lqg) => {
-                Self::with_law(config.with(LqgLaw::new(&lqg, model, &config.limits)?))
+                Self::with_law(config.with(LqgLaw::new(&lqg, model)?))
             }
             ControllerConfig::Mpc(mpc, pi) => {
                 let law = MpcLaw::new(&mpc, pi, model, &config.limits)?;
@@ -154,7 +155,8 @@ impl Controller {
             columns.extend(ADAPT_COLUMNS);
         }
         check_columns(&columns)?;
-        let (preview_len, optimises) = (law.preview_len(), law.optimises());
+        let preview_len = law.preview_len().max(BRAKING_TICKS);
+        let optimises = law.optimises();
         let settings = LoopParts {
             model: parts.model,
             estimator: parts.estimator,

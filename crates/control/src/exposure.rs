@@ -17,3 +17,49 @@ pub(crate) fn mean(ago: f64, exposure_ticks: f64, at: impl Fn(f64) -> Option<f64
     }
     Some(sum / length)
 }
+
+/// Past positions that are kept, ticks.
+const PAST: usize = 24;
+
+/// Positions of a bead or a model at the last ticks. Between ticks it jumps by the direct feedthrough and then moves evenly.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct Past {
+    /// At this tick and those before, newest first, um.
+    positions_um: [f64; PAST],
+    /// Jump at the tick before each of them, um.
+    jumps_um: [f64; PAST],
+}
+
+impl Past {
+    /// A tick on: the position now, and the jump with which the tick began, um.
+    pub(crate) fn push(&mut self, position_um: f64, jump_um: f64) {
+        for (series, newest_um) in [
+            (&mut self.positions_um, position_um),
+            (&mut self.jumps_um, jump_um),
+        ] {
+            series.copy_within(0..PAST - 1, 1);
+            series[0] = newest_um;
+        }
+    }
+
+    /// The newest position, um.
+    pub(crate) fn now(&self) -> f64 {
+        self.positions_um[0]
+    }
+
+    /// Position `ago` ticks ago, um.
+    fn at(&self, ago: f64) -> Option<f64> {
+        let newer = ago.max(0.0).floor();
+        let (part, newer) = (ago.max(0.0) - newer, newer as usize);
+        let (a, b) = (
+            self.positions_um.get(newer)?,
+            self.positions_um.get(newer + 1)?,
+        );
+        Some(a + part * (b + self.jumps_um.get(newer)? - a))
+    }
+
+    /// What a frame shows whose exposure of `exposure` ticks has its middle `age` ticks ago, um; `None` if that is longer ago than is kept.
+    pub(crate) fn seen(&self, age: f64, exposure: f64) -> Option<f64> {
+        mean(age, exposure, |ago| self.at(ago))
+    }
+}

@@ -1,8 +1,9 @@
 //! What a control law is: configuration that does not change, a state beside it, and a step from one tick to the next.
 //!
 //! A law decides where the PZT is to be. Everything around it is the loop's ([`crate::ControlLoop`]): it estimates, and
-//! after the law it adds excitation and what was learned over cycles, keeps the command finite, within range and within
-//! slew, and tells the law what came of it. So a law of another crate is a configuration, a state and one method:
+//! after the law it adds what moves the plant along the reference, excitation and what was learned over cycles, keeps the command
+//! finite, within range and within slew, and tells the law what came of it. So a law of another crate is a configuration, a state and
+//! one method:
 //!
 //! ```
 //! use cellpos_control::*;
@@ -43,6 +44,7 @@
 //! ```
 
 use crate::estimator::Estimate;
+use crate::feedforward::FeedForwardState;
 use crate::tuning::Tuning;
 use std::fmt::Debug;
 
@@ -52,13 +54,21 @@ pub const LAW_COLUMNS: usize = 8;
 /// What a law is given in a tick.
 #[derive(Debug, Clone, Copy)]
 pub struct LawInput<'a> {
-    /// Reference of this tick, um of bead; finite.
+    /// Where the bead is to be now, um; finite: the reference as far as range and slew let the plant follow it.
     pub reference_um: f64,
     /// References of the coming ticks, the next one first; see [`LawInput::preview`].
     pub preview_um: &'a [f64],
     /// Position that this tick's measurement shows: the fix itself where it was used, else what the model says that it
-    /// would be, um. It is of the time of the frame, so older than the tick by the delay.
+    /// would be, um. It is of the time of the frame, so older than the tick by the delay, but for the motion along the reference
+    /// since then, which is added.
     pub bead_um: f64,
+    /// How far the feed-forward has moved the reference since the law took over, um: no error comes of that. The rest of the reference's
+    /// motion are jumps that were not known in advance.
+    pub fed_um: f64,
+    /// The model on the reference before this tick's command.
+    pub on_path: FeedForwardState,
+    /// What the loop adds to the wish in this tick to move the model along the reference, um.
+    pub feed_forward_um: f64,
     /// What the estimator knows.
     pub estimate: Estimate,
     /// Command in force before this tick, less what was learned and the model does not know, um.
@@ -97,10 +107,8 @@ impl LawInput<'_> {
 /// What a law answers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LawOutput {
-    /// Where the PZT is to be, um; the loop keeps it within the limits.
+    /// Where the PZT is to be, um, less what moves it along the reference. The loop adds that, and keeps the sum within the limits.
     pub wish_um: f64,
-    /// Part of it that moves the model along the reference, um from neutral; 0 for a law that does not.
-    pub feed_forward_um: f64,
     /// Account of an optimiser.
     pub solver: SolverReport,
 }
@@ -110,7 +118,6 @@ impl LawOutput {
     pub fn wish(wish_um: f64) -> Self {
         Self {
             wish_um,
-            feed_forward_um: 0.0,
             solver: SolverReport::default(),
         }
     }
@@ -131,8 +138,8 @@ pub trait ControlLaw: Debug + Send + 'static {
     /// A tick that the law decides.
     fn step(&self, state: &mut Self::State, input: &LawInput) -> LawOutput;
 
-    /// What came of the wish of this tick's [`ControlLaw::step`]: `applied_um` is the command after the limits, less
-    /// excitation and what was learned. For anti-windup.
+    /// What came of the wish of this tick's [`ControlLaw::step`]: `applied_um` is the command after the limits, less all that the loop
+    /// added. For anti-windup.
     fn applied(
         &self,
         _state: &mut Self::State,
@@ -157,15 +164,9 @@ pub trait ControlLaw: Debug + Send + 'static {
     /// A tick that never came: the command was held.
     fn skip(&self, _state: &mut Self::State) {}
 
-    /// References of the coming ticks that a step can use.
+    /// References of the coming ticks that a step can use; the loop itself looks some ticks ahead.
     fn preview_len(&self) -> usize {
         0
-    }
-
-    /// The law moves its model along the reference by itself. What is learned over cycles is then what the plant needs
-    /// beyond the model, and the estimator is not told of it.
-    fn feeds_forward(&self) -> bool {
-        false
     }
 
     /// The law optimises: the record keeps the account of its solver.

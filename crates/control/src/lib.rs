@@ -50,6 +50,7 @@ mod lqg;
 mod monitor;
 mod mpc;
 mod partner;
+mod path;
 mod pi;
 mod plant_estimate;
 mod reference;
@@ -82,6 +83,7 @@ pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind, TimedSolve};
+pub use path::PathState;
 pub use partner::{
     Partner, PartnerConfig, PartnerInput, PartnerOutput, PartnerState, PartnerStatus, Probe,
 };

@@ -7,9 +7,8 @@
 use crate::deviation::{DEVIATION, Deviation};
 use crate::error::{BuildError, check};
 use crate::estimator::{Estimator, EstimatorConfig, PredictedState};
-use crate::feedforward::{BRAKING_TICKS, FeedForward, FeedForwardState, Reach};
+use crate::feedforward::FeedForwardState;
 use crate::law::{ControlLaw, LawInput, LawOutput};
-use crate::limits::Limits;
 use crate::linear::LinearLaw;
 use crate::loop_model::{LoopModel, MODES};
 use crate::riccati::{kalman_gain, lq_feedback};
@@ -168,24 +167,16 @@ fn steady_gain(
     )
 }
 
-/// Of the slew in a tick, what a planned move leaves to the correction, um of PZT: two standard deviations of what it asks for in a
-/// hold. Where the plan takes all of it the correction comes late, and a jump at 5 kHz takes 3.6 ms in place of 3.
-const RESERVE_UM: f64 = 0.1;
-
-/// The LQG law: estimator state, feedback, feed-forward along the previewed reference.
+/// The LQG law: feedback of the estimator's state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LqgLaw {
     feedback: Feedback,
-    forward: FeedForward,
-    /// Range of the command and its largest move in a tick, um.
-    reach: Reach,
 }
 
-/// State of [`LqgLaw`].
+/// State of [`LqgLaw`]: nothing but what is recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LqgState {
-    on: FeedForwardState,
-    announced_um: Option<f64>,
+    feed_forward_um: f64,
 }
 
 impl LqgLaw {
@@ -193,17 +184,14 @@ impl LqgLaw {
     ///
     /// # Errors
     /// A weight out of range, or a Riccati equation without solution.
-    pub fn new(config: &Lqg, model: &LoopModel, limits: &Limits) -> Result<Self, BuildError> {
+    pub fn new(config: &Lqg, model: &LoopModel) -> Result<Self, BuildError> {
         Ok(Self {
             feedback: config.feedback(model)?,
-            forward: FeedForward::new(model),
-            reach: Reach::of(limits, model.sample_time_s).with_reserve(RESERVE_UM),
         })
     }
 }
 
 impl ControlLaw for LqgLaw {
-    /// The model on the reference.
     type State = LqgState;
 
     fn start(&self, _command_um: f64) -> LqgState {
@@ -211,35 +199,9 @@ impl ControlLaw for LqgLaw {
     }
 
     fn step(&self, state: &mut LqgState, input: &LawInput) -> LawOutput {
-        self.forward
-            .meet_announced(&mut state.on, input.reference_um, state.announced_um);
-        let deviation = deviation(&input.estimate.now, &state.on);
-        let reach = self.reach.about_neutral(input);
-        let feed_forward_um = self
-            .forward
-            .within(&state.on, |ahead| input.preview(ahead), &reach);
-        self.forward.drive(&mut state.on, feed_forward_um);
-        state.announced_um = input.preview_um.first().copied();
-        let correction_um = self.feedback.correction(&deviation);
-        LawOutput {
-            feed_forward_um,
-            ..LawOutput::wish(input.estimate.neutral_um + feed_forward_um + correction_um)
-        }
-    }
-
-    fn follow(&self, state: &mut LqgState, input: &LawInput, _command_um: f64) {
-        *state = LqgState {
-            on: FeedForward::rest(input.reference_um),
-            announced_um: None,
-        };
-    }
-
-    fn preview_len(&self) -> usize {
-        BRAKING_TICKS
-    }
-
-    fn feeds_forward(&self) -> bool {
-        true
+        state.feed_forward_um = input.feed_forward_um;
+        let deviation = deviation(&input.estimate.now, &input.on_path);
+        LawOutput::wish(input.estimate.neutral_um + self.feedback.correction(&deviation))
     }
 
     fn columns(&self) -> &'static [&'static str] {
@@ -248,7 +210,7 @@ impl ControlLaw for LqgLaw {
 
     fn record(&self, state: &LqgState, out: &mut [f32]) {
         if let Some(value) = out.first_mut() {
-            *value = state.on.last_um as f32;
+            *value = state.feed_forward_um as f32;
         }
     }
 }

@@ -1,7 +1,8 @@
 //! PI control with set-point weight, back-calculation anti-windup and an optional lead on the proportional path.
 //!
 //! `u = I + kp Lead(b r - y) + ki Ts/2 (r - y)`, `I += ki Ts (r - y) + (u_limited - u_requested) Ts / Tt`: the integral by
-//! Tustin's rule, whose phase is that of the continuous one.
+//! Tustin's rule, whose phase is that of the continuous one. The weight b is for jumps of the reference that were not known in advance;
+//! motion that the loop feeds forward needs none.
 //! Gains: `kp` in um of PZT per um of bead, `ki` in 1/s (um of PZT per um of bead and second).
 
 use crate::error::{BuildError, check};
@@ -150,8 +151,9 @@ impl PiLaw {
     }
 
     /// The proportional part, um of PZT; advances the lead's memory.
-    fn proportional(&self, state: &mut PiState, reference_um: f64, bead_um: f64, tuning: &Tuning) {
-        let error = self.config.setpoint_weight * reference_um - bead_um;
+    fn proportional(&self, state: &mut PiState, reference_um: f64, bead_um: f64, input: &LawInput) {
+        let (fed_um, tuning) = (input.fed_um, &input.tuning);
+        let error = self.config.setpoint_weight * (reference_um - fed_um) - (bead_um - fed_um);
         let shaped = match self.lead_of(tuning) {
             Some((b0, b1, a1)) => {
                 let out = b0 * error + state.lead_um;
@@ -209,7 +211,7 @@ impl ControlLaw for PiLaw {
     }
 
     fn step(&self, state: &mut PiState, input: &LawInput) -> LawOutput {
-        self.proportional(state, input.reference_um, input.bead_um, &input.tuning);
+        self.proportional(state, input.reference_um, input.bead_um, input);
         let growth_um = if input.hold() {
             0.0
         } else {
@@ -233,7 +235,7 @@ impl ControlLaw for PiLaw {
     /// While something else decides, PI follows as if the reference were where the bead is: the way from there to the
     /// reference is then a step like any other once PI takes over, not an offset for the integrator alone.
     fn follow(&self, state: &mut PiState, input: &LawInput, command_um: f64) {
-        self.proportional(state, input.bead_um, input.bead_um, &input.tuning);
+        self.proportional(state, input.bead_um, input.bead_um, input);
         self.track(state, command_um);
     }
 

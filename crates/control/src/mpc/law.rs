@@ -6,7 +6,7 @@ use super::feasible;
 use crate::active_set::{ABSENT, QpEnd, QpVectors, ROWS, Stop, VARS, WorkingSet};
 use crate::deviation::DEVIATION;
 use crate::error::BuildError;
-use crate::feedforward::{FeedForward, FeedForwardState, Reach};
+use crate::feedforward::{FeedForward, Reach};
 use crate::law::{ControlLaw, LawInput, LawOutput, SolverReport, SolverStatus, SolverTerms};
 use crate::limits::Limits;
 use crate::loop_model::LoopModel;
@@ -23,8 +23,6 @@ pub(super) struct ReferencePlan {
     /// Position of the model on it less the reference, after each tick.
     error: [f64; HORIZON],
     reference: [f64; HORIZON],
-    /// The model on the reference after the first tick of it.
-    next: FeedForwardState,
 }
 
 /// The law for one plant and its limits.
@@ -37,12 +35,12 @@ pub struct MpcLaw {
     reach: Reach,
 }
 
-/// State of the law: model on the reference, previous plan, warm start, the fallback's state and the solver's workspace.
+/// State of the law: previous plan, warm start, the fallback's state and the solver's workspace.
 #[derive(Debug)]
 pub struct MpcState {
-    pub(super) on_reference: FeedForwardState,
-    pub(super) announced_um: Option<f64>,
+    feed_forward_um: f64,
     pi: PiState,
+    /// Newest plan: commands less the feed-forward.
     plan_um: [f64; HORIZON],
     /// Corrections of the newest plan.
     corrections: [f64; VARS],
@@ -127,9 +125,8 @@ impl MpcLaw {
     /// The command of this tick, or `None` when there is no plan to follow.
     fn plan(&self, state: &mut MpcState, input: &LawInput) -> (Option<f64>, SolverReport) {
         let neutral = input.estimate.neutral_um;
-        let reference = self.reference_plan(&state.on_reference, input);
-        let deviation = deviation(&input.estimate.now, &state.on_reference);
-        state.on_reference = reference.next;
+        let reference = self.reference_plan(input);
+        let deviation = deviation(&input.estimate.now, &input.on_path);
         let vectors = self.vectors(input, &deviation, &reference);
         let (from, stop) = match input.solver {
             SolverTerms::Until(deadline) => (
@@ -182,9 +179,8 @@ impl MpcLaw {
                 .iter()
                 .zip(&w)
                 .flat_map(|(length, w)| std::iter::repeat_n(w, *length));
-            let plan = state.plan_um.iter_mut().zip(&reference.command);
-            for ((slot, command), w) in plan.zip(corrections) {
-                *slot = neutral + command + w;
+            for (slot, w) in state.plan_um.iter_mut().zip(corrections) {
+                *slot = neutral + w;
             }
             state.used = 1;
             state.corrections = w;
@@ -206,28 +202,26 @@ impl MpcLaw {
         (planned, report(status))
     }
 
-    /// Feed-forward along the preview, kept within range and slew; the model on the reference follows what was kept.
-    pub(super) fn reference_plan(&self, on: &FeedForwardState, input: &LawInput) -> ReferencePlan {
+    /// Feed-forward along the preview, kept within range and slew; the first command is the loop's.
+    pub(super) fn reference_plan(&self, input: &LawInput) -> ReferencePlan {
         let reach = self.reach.about_neutral(input);
-        let mut on = *on;
+        let mut on = input.on_path;
         let mut plan = ReferencePlan {
             command: [0.0; HORIZON],
             error: [0.0; HORIZON],
             reference: [0.0; HORIZON],
-            next: on,
         };
         for i in 0..HORIZON {
             let next = input.preview(i);
-            let command = self
-                .forward
-                .within(&on, |ahead| input.preview(i + ahead), &reach);
+            let command = if i == 0 {
+                input.feed_forward_um
+            } else {
+                (self.forward).within(&on, |ahead| input.preview(i + ahead), &reach)
+            };
             self.forward.drive(&mut on, command);
             plan.command[i] = command;
             plan.reference[i] = next;
             plan.error[i] = self.forward.position(&on) - next;
-            if i == 0 {
-                plan.next = on;
-            }
         }
         plan
     }
@@ -302,8 +296,7 @@ impl ControlLaw for MpcLaw {
             SolverKind::ActiveSet => None,
         };
         MpcState {
-            on_reference: FeedForwardState::default(),
-            announced_um: None,
+            feed_forward_um: 0.0,
             pi: self.pi.start(command_um),
             plan_um: [0.0; HORIZON],
             corrections: [0.0; VARS],
@@ -314,23 +307,15 @@ impl ControlLaw for MpcLaw {
     }
 
     fn step(&self, state: &mut MpcState, input: &LawInput) -> LawOutput {
-        self.forward.meet_announced(
-            &mut state.on_reference,
-            input.reference_um,
-            state.announced_um,
-        );
-        state.announced_um = input.preview_um.first().copied();
+        state.feed_forward_um = input.feed_forward_um;
         let fallback = self.pi.step(&mut state.pi, input);
         if input.estimate.stuck {
             state.forget();
-            self.forward.step(&mut state.on_reference, input.preview(0));
             return fallback;
         }
         let (plan_um, solver) = self.plan(state, input);
         LawOutput {
             wish_um: plan_um.unwrap_or(fallback.wish_um),
-            // A fallback does not feed forward.
-            feed_forward_um: plan_um.map_or(0.0, |_| state.on_reference.last_um),
             solver,
         }
     }
@@ -352,17 +337,11 @@ impl ControlLaw for MpcLaw {
 
     fn follow(&self, state: &mut MpcState, input: &LawInput, command_um: f64) {
         state.forget();
-        state.on_reference = FeedForward::rest(input.reference_um);
-        state.announced_um = None;
         self.pi.follow(&mut state.pi, input, command_um);
     }
 
     fn preview_len(&self) -> usize {
         HORIZON
-    }
-
-    fn feeds_forward(&self) -> bool {
-        true
     }
 
     fn optimises(&self) -> bool {
@@ -374,7 +353,7 @@ impl ControlLaw for MpcLaw {
     }
 
     fn record(&self, state: &MpcState, out: &mut [f32]) {
-        let values = [state.on_reference.last_um, state.pi.integral_um];
+        let values = [state.feed_forward_um, state.pi.integral_um];
         for (out, value) in out.iter_mut().zip(values) {
             *out = value as f32;
         }

@@ -1,6 +1,6 @@
 //! The problems of a loop, and how long each solver takes for them: for tables beside other solvers.
 
-use super::law::{MpcLaw, MpcState};
+use super::law::MpcLaw;
 use crate::active_set::{QpEnd, QpMatrices, QpVectors, Stop};
 use crate::law::{ControlLaw, LawInput};
 use crate::lqg::deviation;
@@ -24,12 +24,9 @@ impl MpcLaw {
     }
 
     /// The problem that [`ControlLaw::step`] would solve now.
-    pub fn problem(&self, state: &MpcState, input: &LawInput) -> QpVectors {
-        let mut on = state.on_reference;
-        self.forward
-            .meet_announced(&mut on, input.reference_um, state.announced_um);
-        let reference = self.reference_plan(&on, input);
-        let deviation = deviation(&input.estimate.now, &on);
+    pub fn problem(&self, input: &LawInput) -> QpVectors {
+        let reference = self.reference_plan(input);
+        let deviation = deviation(&input.estimate.now, &input.on_path);
         self.vectors(input, &deviation, &reference)
     }
 

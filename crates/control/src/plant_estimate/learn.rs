@@ -128,7 +128,7 @@ impl Adapter {
         let moved = dot(&p, &weights(believed.1));
         // The error of the model along a reference is not a line.
         let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
-        if self.cancels && chosen_um * chosen_um < usual_um2 {
+        if chosen_um * chosen_um < usual_um2 {
             let most = state.colour.most_um();
             let left_um = (y - gain * in_force).clamp(-most, most) / gain;
             let noise_um2 = state.colour.white_um2 / (gain * gain);

@@ -87,8 +87,6 @@ pub(crate) struct Adapter {
     interval: f64,
     planned_gap: u32,
     exposure_ticks: f64,
-    /// The loop cancels lines.
-    cancels: bool,
     lines: LineSettings,
     forward: FeedForward,
     /// Command for a tick that moves the bead from the middle to a side of the dither, um.
@@ -134,15 +132,11 @@ pub(crate) struct TickOutcome {
 }
 
 impl Adapter {
-    /// For a model and the noise of its estimator; it cancels lines in the flow if `cancels`.
+    /// For a model and the noise of its estimator.
     ///
     /// # Errors
     /// As [`Estimator::new`].
-    pub(crate) fn new(
-        config: EstimatorConfig,
-        model: LoopModel,
-        cancels: bool,
-    ) -> Result<Self, BuildError> {
+    pub(crate) fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
         let ts = model.sample_time_s;
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
         let drift_um2 =
@@ -157,7 +151,6 @@ impl Adapter {
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
-            cancels,
             lines: LineSettings::new(ts, config.ticks_per_fix),
             forward: FeedForward::new(&model),
             delay_samples: model.delay_samples(),
@@ -314,7 +307,7 @@ impl Adapter {
     /// The command of the next tick: it moves the model opposite to the lines.
     fn cancel_lines(&self, state: &mut AdaptState, free: bool) {
         state.cancel_um = 0.0;
-        if !(free && self.cancels) {
+        if !free {
             state.inverse = None;
             return;
         }

@@ -3,19 +3,13 @@
 use super::evidence::{LAGS, MEMBERS};
 use super::whiten::{Correction, Track, Whitener};
 use crate::estimator::{Estimator, Fix, PredictedState};
-use crate::exposure;
-
-/// Past positions of the model that are kept, ticks.
-const PAST: usize = 24;
+use crate::exposure::Past;
 
 /// The model and its recent positions, and each delay's series in the filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Motion {
     model: PredictedState,
-    /// Positions of the model at this tick and those before, newest first, um.
-    past_um: [f64; PAST],
-    /// Jump of the model by the direct feedthrough at the tick before each of these positions, um.
-    jumps_um: [f64; PAST],
+    past: Past,
     tracks: Option<[Track; MEMBERS]>,
 }
 
@@ -28,8 +22,7 @@ impl Motion {
                 last_um: command_um,
                 ..PredictedState::default()
             },
-            past_um: [0.0; PAST],
-            jumps_um: [0.0; PAST],
+            past: Past::default(),
             tracks: None,
         }
     }
@@ -37,21 +30,12 @@ impl Motion {
     /// One tick on with a command, um. Whether the model is still finite.
     #[must_use]
     pub(super) fn drive(&mut self, estimator: &Estimator, command_um: f64) -> bool {
-        self.jumps_um.copy_within(0..PAST - 1, 1);
         let change_um = command_um - self.model.last_um;
-        self.jumps_um[0] = estimator.model().feedthrough * change_um;
         self.model = estimator.tick_state(&self.model, command_um);
-        self.past_um.copy_within(0..PAST - 1, 1);
-        self.past_um[0] = estimator.position(&self.model);
-        self.past_um[0].is_finite()
-    }
-
-    /// Position `ago` ticks ago, um: between ticks the bead jumps by the direct feedthrough and then moves evenly.
-    fn past(&self, ago: f64) -> Option<f64> {
-        let newer = ago.max(0.0).floor();
-        let (part, newer) = (ago.max(0.0) - newer, newer as usize);
-        let (a, b) = (self.past_um.get(newer)?, self.past_um.get(newer + 1)?);
-        Some(a + part * (b + self.jumps_um.get(newer)? - a))
+        let position_um = estimator.position(&self.model);
+        let jump_um = estimator.model().feedthrough * change_um;
+        self.past.push(position_um, jump_um);
+        position_um.is_finite()
     }
 
     /// State of the model now.
@@ -61,7 +45,7 @@ impl Motion {
 
     /// Position at the exposure of a fix that is `delay` ticks old, um; `None` if that is longer ago than is kept.
     pub(super) fn seen(&self, delay: f64, exposure: f64) -> Option<f64> {
-        exposure::mean(delay, exposure, |ago| self.past(ago))
+        self.past.seen(delay, exposure)
     }
 
     /// The same for each lag beyond `delay`, ticks.
