@@ -203,11 +203,14 @@ impl<C: Camera> VisionSource<C> {
         };
         let exposed_s = stamp.exposure_ns as f64 * 1e-9;
         let half_ns = stamp.exposure_ns / 2;
-        let (x, y) = mean_px_per_s(at_ns - half_ns, at_ns + half_ns);
+        let first = mean_px_per_s(at_ns - half_ns, at_ns);
+        let second = mean_px_per_s(at_ns, at_ns + half_ns);
+        let half_s = 0.5 * exposed_s;
         let commanded = Commanded {
             flow_px_per_s: before_ns
                 .map_or((0.0, 0.0), |before_ns| mean_px_per_s(before_ns, at_ns)),
-            streak_px: (x * exposed_s, y * exposed_s),
+            streak_px: (half_s * (first.0 + second.0), half_s * (first.1 + second.1)),
+            turn_px: (half_s * (second.0 - first.0), half_s * (second.1 - first.1)),
             exposure_s: exposed_s,
         };
         let time_s = (at_ns - first_ns) as f64 * 1e-9;

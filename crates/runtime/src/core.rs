@@ -33,7 +33,7 @@ mod watches;
 use crate::arming::{Arming, ArmingConfig, ArmingState};
 use crate::grid::Grid;
 use crate::learners::Learners;
-use crate::life::{EventKind, Events, FreezeReason, FreezeReasons, Life, Request, SafeReason};
+use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
 use crate::reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
 use crate::tick::Tick;
 pub use crate::tick::{Action, Counts, TickInput, TickOutput};
@@ -76,7 +76,7 @@ struct State {
     near_limit: bool,
     vision_slow_since_ns: Option<i64>,
     coasting_since_ns: Option<i64>,
-    frozen: FreezeReasons,
+    frozen: life_cycle::FreezeReasons,
     frozen_since_ns: i64,
     stuck_since_ns: Option<i64>,
     stuck_told: bool,
@@ -91,8 +91,7 @@ struct State {
     in_force: in_force::Board,
     told_um: f64,
     following: following::Following,
-    /// Where the PZT rests while it is found out whether commands work the other way round, um, and the last tick of that.
-    pause: Option<(f64, u64)>,
+    pauses: watches::Pauses,
     /// It was found that the bead does not feel the commands.
     clipped: bool,
     /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
@@ -217,7 +216,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 near_limit: false,
                 vision_slow_since_ns: None,
                 coasting_since_ns: None,
-                frozen: FreezeReasons::default(),
+                frozen: Default::default(),
                 frozen_since_ns: 0,
                 stuck_since_ns: None,
                 stuck_told: false,
@@ -229,9 +228,9 @@ impl<R: ReferenceGenerator> Core<R> {
                 in_force: in_force::Board::new(displacement_um, neutral_um),
                 told_um: neutral_um,
                 following,
-                pause: None,
+                pauses: Default::default(),
                 clipped: false,
-                rest: rest::Rest::new(neutral_um, timing.camera_delay_ms * 1e-3 / sample_s),
+                rest: rest::Rest::new(neutral_um),
                 rest_um: neutral_um,
                 pictures_repeated: 0,
                 parked_at: None,
@@ -464,8 +463,8 @@ impl<R: ReferenceGenerator> Core<R> {
             zero_flow_shift_um,
         };
         let output = self.controller.step(&given);
+        self.watch_rest(fix, &output, tick.steps);
         self.state.told_um = output.neutral_um;
-        self.watch_rest(fix, &output);
         let obeyed = in_force.is_none();
         self.watch_following(fix, generated.reference_um, obeyed, &output, tick);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;

@@ -142,34 +142,6 @@ pub enum FreezeReason {
     LineStalled,
 }
 
-/// The reasons for which the bead is frozen at present: it goes on when the last is gone.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct FreezeReasons(u8);
-
-impl FreezeReasons {
-    pub(crate) fn any(self) -> bool {
-        self.0 != 0
-    }
-
-    pub(crate) fn has(self, reason: FreezeReason) -> bool {
-        self.0 & (1 << reason as u8) != 0
-    }
-
-    /// Adds one; whether it is the first.
-    pub(crate) fn add(&mut self, reason: FreezeReason) -> bool {
-        let first = !self.any();
-        self.0 |= 1 << reason as u8;
-        first
-    }
-
-    /// Takes one away; whether it was the last.
-    pub(crate) fn remove(&mut self, reason: FreezeReason) -> bool {
-        let before = *self;
-        self.0 &= !(1 << reason as u8);
-        before.any() && !self.any()
-    }
-}
-
 /// Why arming was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -343,6 +315,11 @@ pub enum EventKind {
     SaturationEnded {
         /// How long it was there.
         lasted_ms: f64,
+    },
+    /// The bead seemed to move against the commands: the loop let go of it for some ticks, to see whether it then stops.
+    LoopPaused {
+        /// Times since the last such event.
+        count: u32,
     },
     /// The bead follows the commands up to a level and no further: amplifier, supply or PZT is clipped.
     ActuatorClipped {

@@ -7,8 +7,8 @@
 //! in proportion to the commands for long. Commands that cancel a flow look as if neither moved the bead: one that does not feel
 //! them is looked for only while it goes further and further away.
 //!
-//! While the loop pushes, a wrong sign and a flow that rises look alike. In a pause they do not: with the PZT where a bead with a
-//! wrong sign rests, that bead stops, and a flow carries it on. So a wrong sign is told after a pause of a few ticks only.
+//! While the loop pushes, a wrong sign and a flow that rises look alike. In a pause they do not: with the PZT at the zero flow of
+//! before, a bead whose sign is wrong stops, and a flow carries it on. So a wrong sign is told after a pause of a few ticks only.
 //!
 //! A picture that shakes and an actuator that rings move the bead in no hypothesis of these. A wrong sign must then predict the motion
 //! better than its mere size does.
@@ -26,7 +26,7 @@ use cellpos_control::{EstimatorConfig, LoopModel};
 /// e^20 would do for a year. The rest is for flows that rise as no model here does: evidence of a wrong sign grows with the square of an
 /// error that grows e-fold in 8 ms, so that it costs 4 ms ln(32 / 20) = 2 ms.
 const EVIDENCE: f64 = 32.0;
-/// Evidence of a wrong sign at which the loop pauses, its PZT where the bead then rests: there the bead stops if the sign is wrong, and a
+/// Evidence of a wrong sign at which the loop pauses, its PZT at the zero flow of before: there the bead stops if the sign is wrong, and a
 /// flow goes on. The rest of the evidence is what it costs the flow to stop at just that time, e^15 by [`cellpos_control::flow_step_log_density`].
 /// In a hold it comes about once in e^16 ticks, 2.5 h, and costs 60 nm.
 const PAUSE_EVIDENCE: f64 = 0.5 * EVIDENCE;
@@ -57,19 +57,25 @@ const SLOW_SHARE: f64 = 0.5;
 /// What the bead does instead of following.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Instead {
-    /// Perhaps it goes against the commands: a pause tells.
-    Unclear,
     /// It goes against the commands.
     Against,
     /// It does not feel them.
     Adrift,
 }
 
-/// A pause of the loop: ticks since it began, and the evidence before its command showed.
+/// A pause of the loop: where its PZT rests, um, ticks since it began, and the evidence before its command showed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Pause {
+    rest_um: f64,
     ticks: usize,
     evidence: f64,
+}
+
+impl Pause {
+    /// It lasts until its command, which takes `delay` ticks to show, has shown for as long again.
+    fn is_over(&self, delay: usize) -> bool {
+        self.ticks >= 2 * delay
+    }
 }
 
 /// A hypothesis beside the usual one, and how much likelier it is, natural logarithm of the odds.
@@ -77,7 +83,7 @@ struct Pause {
 struct Rival {
     belief: Belief,
     evidence: f64,
-    /// Zero flow when it began to be the likelier one, um.
+    /// Zero flow of the quiet time before it began to be the likelier one, um.
     zero_flow_um: f64,
     /// The pause that was made for it.
     pause: Option<Pause>,
@@ -102,7 +108,7 @@ impl Rival {
         if pause.ticks <= delay {
             pause.evidence = self.evidence;
         }
-        let over = pause.ticks >= 2 * delay;
+        let over = pause.is_over(delay);
         // A bead that went on in the pause is carried by a flow.
         (over, unlikely || over && self.evidence <= pause.evidence)
     }
@@ -156,7 +162,7 @@ pub(super) struct Seen {
     pub reference_um: f64,
     /// The command of this tick, which shows one delay later.
     pub command_um: f64,
-    /// Estimate of the zero flow.
+    /// Zero flow of the last quiet time.
     pub zero_flow_um: f64,
 }
 
@@ -225,9 +231,10 @@ impl Following {
         }
     }
 
-    /// Ticks of a pause: until its command shows, and as long again.
-    pub(super) fn pause_ticks(&self) -> u64 {
-        2 * self.delay as u64
+    /// Where the PZT is to rest while a pause tells whether the bead goes against the commands, um.
+    pub(super) fn pause_um(&self) -> Option<f64> {
+        let pause = self.beliefs.as_ref()?.against.pause?;
+        (!pause.is_over(self.delay)).then_some(pause.rest_um)
     }
 
     /// The ticks before do not count: the loop did not run, the bead was held by something, or what stood at the PZT is not known.
@@ -246,7 +253,7 @@ impl Following {
         });
     }
 
-    /// Takes in a tick. Gives what the bead does instead of following the commands, and the displacement at which it then rests, um.
+    /// Takes in a tick. Gives what the bead does instead of following the commands, and the displacement at which it rested before, um.
     pub(super) fn step(&mut self, seen: &Seen) -> Option<(Instead, f64)> {
         if self.gain == 0.0 {
             return None;
@@ -326,16 +333,14 @@ impl Following {
         } = beliefs;
         let evidence = against.evidence.min(*beyond_shake);
         if evidence > PAUSE_EVIDENCE.max(adrift.evidence) {
-            let path = against.belief.likelier();
-            let rest_um = path.rest_um(self.mean_um, self.gain);
+            let rest_um = against.zero_flow_um;
             if against.pause.is_none() {
                 against.pause = Some(Pause {
+                    rest_um,
                     ticks: 0,
                     evidence: against.evidence,
                 });
-                return Some((Instead::Unclear, rest_um));
-            }
-            if evidence > EVIDENCE && paused {
+            } else if evidence > EVIDENCE && paused {
                 return Some((Instead::Against, rest_um));
             }
         }

@@ -2,7 +2,7 @@
 
 use super::Core;
 use crate::arming::{ArmingInput, ArmingState, Step};
-use crate::life::{EventKind, FreezeReason, FreezeReasons, Life, Request, SafeReason};
+use crate::life::{EventKind, FreezeReason, Life, Request, SafeReason};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
 use crate::tick_record::TickFlags;
@@ -19,6 +19,34 @@ const BLIND: [FreezeReason; 4] = [
     FreezeReason::PictureFrozen,
     FreezeReason::NotFollowing,
 ];
+
+/// The reasons for which the bead is frozen at present: it goes on when the last is gone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct FreezeReasons(u8);
+
+impl FreezeReasons {
+    pub(super) fn any(self) -> bool {
+        self.0 != 0
+    }
+
+    pub(super) fn has(self, reason: FreezeReason) -> bool {
+        self.0 & (1 << reason as u8) != 0
+    }
+
+    /// Adds one; whether it is the first.
+    pub(super) fn add(&mut self, reason: FreezeReason) -> bool {
+        let first = !self.any();
+        self.0 |= 1 << reason as u8;
+        first
+    }
+
+    /// Takes one away; whether it was the last.
+    pub(super) fn remove(&mut self, reason: FreezeReason) -> bool {
+        let before = *self;
+        self.0 &= !(1 << reason as u8);
+        before.any() && !self.any()
+    }
+}
 
 impl<R: ReferenceGenerator> Core<R> {
     /// Time without a bead after which a run ends, ns.
@@ -114,10 +142,10 @@ impl<R: ReferenceGenerator> Core<R> {
         }
         let frozen = self.state.frozen;
         match (self.state.life, frozen.any()) {
-            (Life::Running, false) => match self.state.pause {
-                Some((rest_um, last)) if tick.index <= last => Mode::Direct(rest_um),
-                _ => Mode::Run,
-            },
+            (Life::Running, false) => {
+                let pause_um = self.state.following.pause_um();
+                pause_um.map_or(Mode::Run, Mode::Direct)
+            }
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
                 // With the bead in view the estimate of the zero flow goes on and is the best there is.
@@ -141,7 +169,7 @@ impl<R: ReferenceGenerator> Core<R> {
     }
 
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
-        let rest_um = (self.state.rest).zero_flow_um(self.controller.neutral_um());
+        let rest_um = self.state.rest.zero_flow_um();
         self.freeze_at(reason, rest_um, tick);
     }
 

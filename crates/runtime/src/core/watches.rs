@@ -2,30 +2,62 @@
 
 use super::Core;
 use super::following::{Instead, Seen};
+use super::rest::Seen as RestSeen;
 use crate::life::{EventKind, FreezeReason, Life};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
 use crate::tick_record::TickFlags;
 use cellpos_control::{LoopOutput, Measurement as LoopMeasurement};
 
+/// What was said of the pauses of the loop.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Pauses {
+    now: bool,
+    /// Those that no event tells of yet, and when one did last.
+    untold: u32,
+    told_ns: Option<i64>,
+}
+
+impl Pauses {
+    /// Takes in whether the loop pauses, and says how often it did.
+    fn step(&mut self, pauses: bool, tick: &mut Tick) {
+        /// Shortest time between two such events: a flow that rises may ask for pause after pause.
+        const BETWEEN_NS: i64 = 1_000_000_000;
+        self.untold += u32::from(pauses && !self.now);
+        self.now = pauses;
+        let told = |at_ns: i64| tick.time_ns - at_ns < BETWEEN_NS;
+        if self.untold > 0 && !self.told_ns.is_some_and(told) {
+            tick.event(EventKind::LoopPaused { count: self.untold });
+            (self.untold, self.told_ns) = (0, Some(tick.time_ns));
+        }
+    }
+}
+
 impl<R: ReferenceGenerator> Core<R> {
     /// What the newest fix says of the zero flow at which a PZT would stop.
-    pub(super) fn watch_rest(&mut self, fix: Option<LoopMeasurement>, output: &LoopOutput) {
+    pub(super) fn watch_rest(
+        &mut self,
+        fix: Option<LoopMeasurement>,
+        output: &LoopOutput,
+        steps: u64,
+    ) {
+        self.state.rest.wait(steps);
         let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
             return;
         };
         let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
-        self.state.rest.step(
-            output.neutral_um,
-            output.innovation_um,
-            walk_um2 + fix.variance_um2.max(0.0),
-            output.flags,
-            self.sample_s,
-        );
+        let model = self.controller.settings().model;
+        let gain = self.controller.adaptation().map_or(1.0, |now| now.gain);
+        let seen = RestSeen {
+            innovation_um: output.innovation_um,
+            variance_um2: walk_um2 + fix.variance_um2.max(0.0),
+            newest_um: [self.state.told_um, output.neutral_um],
+            gain: gain * model.fast_gain_per_s() * model.sample_time_s,
+        };
+        self.state.rest.step(&seen, output.flags, self.sample_s);
     }
 
-    /// A bead that moves against the commands is frozen at the zero flow that its motion shows if they work the other way round; one
-    /// that follows them up to a level and no further, at the zero flow of before.
+    /// A bead that moves against the commands, or follows them up to a level and no further, is frozen at the zero flow of before.
     pub(super) fn watch_following(
         &mut self,
         fix: Option<LoopMeasurement>,
@@ -41,6 +73,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let driven = state.life == Life::Running && !state.frozen.any();
         if !driven || !obeyed || output.flags.stuck {
             state.following.clear();
+            state.pauses.now = false;
             return;
         }
         let on_time = fix.filter(|fix| {
@@ -50,22 +83,20 @@ impl<R: ReferenceGenerator> Core<R> {
             fix: on_time.map(|fix| (fix.position_um, fix.variance_um2)),
             reference_um,
             command_um: output.command_um,
-            zero_flow_um: output.neutral_um,
+            zero_flow_um: state.rest.zero_flow_um(),
         });
+        let pauses = state.following.pause_um().is_some();
+        state.pauses.step(pauses, tick);
         match found {
             None => {}
-            Some((Instead::Unclear, rest_um)) => {
-                let ticks = state.following.pause_ticks();
-                state.pause = Some((rest_um, tick.index + ticks));
-            }
             Some((Instead::Against, rest_um)) => {
                 self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
             }
-            Some((Instead::Adrift, level_um)) => {
+            Some((Instead::Adrift, rest_um)) => {
                 state.clipped = true;
                 tick.flags.set(TickFlags::CLIPPED);
-                tick.event(EventKind::ActuatorClipped { level_um });
-                self.freeze(FreezeReason::NotFollowing, tick);
+                tick.event(EventKind::ActuatorClipped { level_um: rest_um });
+                self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
             }
         }
     }

@@ -21,7 +21,7 @@ use crate::pool::Pool;
 use crate::residue::Residues;
 use crate::seed;
 use crate::speckle;
-use crate::streak::Comb;
+use crate::streak::{Comb, Way};
 use crate::template::Template;
 use view::View;
 
@@ -55,7 +55,7 @@ pub struct Localiser {
     noise_variance: Option<f64>,
     learner: Option<Learner>,
     /// Way of the bead during the exposure, expected and in use (px).
-    streak_px: (f64, f64),
+    streak: Way,
     comb: Comb,
     /// What the template leaves of the beads' windows.
     residues: Residues,
@@ -109,7 +109,7 @@ impl Localiser {
             sign,
             noise_variance: None,
             learner,
-            streak_px: (0.0, 0.0),
+            streak: Way::default(),
             comb: Comb::STILL,
             residues: Residues::new(),
             cleans: false,
@@ -160,8 +160,14 @@ impl Localiser {
     /// Says how far beads go while the next frames are exposed, from the start to the end of an exposure (px); noughts for
     /// beads at rest. The length is a start value, refined by the fit; the direction is taken as it is.
     pub fn expect_streak(&mut self, way_px: (f64, f64)) {
-        self.streak_px = way_px;
-        self.comb = Comb::new(way_px, self.template.radius_px());
+        self.streak.whole_px = way_px;
+        self.comb = Comb::new(self.streak, self.template.radius_px());
+    }
+
+    /// Says how much further they go in the second half of an exposure than in the first (px): a command takes effect meanwhile.
+    pub fn expect_turn(&mut self, turn_px: (f64, f64)) {
+        self.streak.turn_px = turn_px;
+        self.comb = Comb::new(self.streak, self.template.radius_px());
     }
 
     /// Position of the bead nearest to `guess` (px), or of the strongest in the frame when there is no guess.
@@ -249,7 +255,7 @@ impl Localiser {
     }
 
     fn attempt(&mut self, view: &View, (x_px, y_px): (f64, f64), side_px: usize) -> Fix {
-        self.comb = Comb::new(self.streak_px, self.template.radius_px());
+        self.comb = Comb::new(self.streak, self.template.radius_px());
         self.template.stretch_to(1.0);
         self.cleans = false;
         self.lopsided = 0.0;
@@ -322,8 +328,8 @@ impl Localiser {
         beads: impl Iterator<Item = (f64, f64, f64)> + Clone,
     ) -> Option<f64> {
         let radius_px = self.template.radius_px();
-        let (x_px, y_px) = self.streak_px;
-        let of = |factor: f64| Comb::new((factor * x_px, factor * y_px), radius_px);
+        let streak = self.streak;
+        let of = |factor: f64| Comb::new(streak.times(factor), radius_px);
         let (shorter, longer) = (of(factor * (1.0 - SECANT)), of(factor * (1.0 + SECANT)));
         let change = fit::stretch(&self.crop, &self.template, &shorter, &longer, beads)?;
         let better =

@@ -62,7 +62,7 @@ impl Localiser {
             bead.contrast = start.contrast;
         }
         let beads = beads.get_mut(..count)?;
-        self.comb = Comb::new(self.streak_px, self.template.radius_px());
+        self.comb = Comb::new(self.streak, self.template.radius_px());
         self.template.stretch_to(1.0);
         if !self.take_all(frame, beads) {
             return None;

@@ -12,6 +12,8 @@ pub struct Commanded {
     /// Way that the flow goes while the frame is exposed, px: a fast bead's image is drawn out along it. Noughts where the
     /// exposure is not known.
     pub streak_px: (f64, f64),
+    /// What the second half of that way is longer than the first, px.
+    pub turn_px: (f64, f64),
     /// Exposure time, s; 0 where it is not known.
     pub exposure_s: f64,
 }
@@ -22,6 +24,7 @@ impl From<(f64, f64)> for Commanded {
         Commanded {
             flow_px_per_s,
             streak_px: (0.0, 0.0),
+            turn_px: (0.0, 0.0),
             exposure_s: 0.0,
         }
     }

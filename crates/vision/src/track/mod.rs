@@ -126,13 +126,16 @@ impl Tracker {
         let Commanded {
             flow_px_per_s,
             streak_px,
+            turn_px,
             exposure_s,
         } = commanded.into();
         self.streak_px = self
             .chosen
             .map_or(streak_px, |c| c.motion.way_px(streak_px, exposure_s));
         self.exposure_s = exposure_s;
+        let turn_px = (self.chosen).map_or(turn_px, |c| c.motion.way_px(turn_px, 0.0));
         self.localiser.expect_streak(self.streak_px);
+        self.localiser.expect_turn(turn_px);
         let (dt_s, time_s) = self.standing.elapse(time_s);
         self.frames = self.frames.wrapping_add(1);
         if let Some(chosen) = &mut self.chosen {

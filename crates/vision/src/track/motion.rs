@@ -55,6 +55,8 @@ struct Axis {
     pe: f64,
     ve: f64,
     ee: f64,
+    /// Commanded flow of the frame before, px/s.
+    flow: f64,
 }
 
 impl Axis {
@@ -69,11 +71,12 @@ impl Axis {
             pe: 0.0,
             ve: 0.0,
             ee: 0.0,
+            flow: 0.0,
         }
     }
 
     fn predict(&mut self, dt_s: f64, flow: f64, r: &Randomness) {
-        // Half of the error's variance stays from frame to frame (gain), half does not (delay).
+        // Half of the error's variance is of the flow and stays from frame to frame (gain), half is of its changes (delay).
         let half = 0.5 * r.flow_error * r.flow_error;
         let kept = (-dt_s / FLOW_MEMORY_S).exp();
         self.e *= kept;
@@ -81,11 +84,12 @@ impl Axis {
         self.ve *= kept;
         self.ee = kept * kept * self.ee + (1.0 - kept * kept) * half;
         let way = dt_s * flow;
+        let change = dt_s * (flow - std::mem::replace(&mut self.flow, flow));
         self.p += dt_s * self.v + way * (1.0 + self.e);
         self.pp += dt_s * (2.0 * self.pv + dt_s * self.vv)
             + way * (2.0 * self.pe + 2.0 * dt_s * self.ve + way * self.ee)
             + 2.0 * r.diffusion_px2_per_s * dt_s
-            + half * way * way;
+            + half * change * change;
         self.pv += dt_s * self.vv + way * self.ve;
         self.pe += dt_s * self.ve + way * self.ee;
         self.vv += r.velocity_walk * r.velocity_walk * dt_s;

@@ -114,6 +114,7 @@ fn tracking_through_an_encounter_and_a_loss_allocates_nothing() {
         // A streak's template is drawn in place, too.
         let commanded = Commanded {
             streak_px: if n % 8 == 7 { (3.0, 0.0) } else { (0.0, 0.0) },
+            turn_px: (0.0, 0.0),
             exposure_s: 5e-4,
             ..Commanded::default()
         };

@@ -29,6 +29,28 @@ fn streak(p: &RingProfile, (dx, dy): (f64, f64), way: (f64, f64)) -> (f64, f64, 
     (sums.0 / n, sums.1 / n, sums.2 / n)
 }
 
+/// A frame of one bead that turns while the shutter is open: the second half of its way is longer than the first by `turn_px`. Its position
+/// is the mean of the way.
+fn render_turning(
+    p: &RingProfile,
+    (x, y): (f64, f64),
+    (way_px, turn_px): (f64, f64),
+    snr: f64,
+    random: &mut Random,
+) -> Vec<u16> {
+    let pixel = |k: usize| {
+        let (i, j) = ((k % WIDTH) as f64, (k / WIDTH) as f64);
+        let value: f64 = (0..POINTS)
+            .map(|k| (k as f64 + 0.5) / POINTS as f64 - 0.5)
+            .map(|t| x + way_px * t + turn_px * (t.abs() - 0.25))
+            .map(|x| p.value(f64::hypot(i - x, j - y)))
+            .sum();
+        let grey = snr * NOISE * value / POINTS as f64;
+        (BACKGROUND + grey + NOISE * random.normal()).round() as u16
+    };
+    (0..WIDTH * HEIGHT).map(pixel).collect()
+}
+
 /// A frame of streaks, all along `way`.
 fn render(
     p: &RingProfile,
@@ -125,6 +147,33 @@ fn streaks_are_localised_at_their_bound_though_the_speed_is_half_known() {
             assert!(bias.0.abs() < 4.0 * limit.0 * sigma + 0.005, "{bias:?}");
             assert!(bias.1.abs() < 4.0 * limit.1 * sigma + 0.005, "{bias:?}");
         }
+    }
+}
+
+#[test]
+fn a_bead_that_a_command_turns_while_it_is_exposed_is_where_it_was_on_average() {
+    let profile = RingProfile::new(EDGE_PX).unwrap();
+    let snr = 60.0;
+    for (way_px, turn_px) in [(8.0, 2.0), (12.0, -4.0), (15.0, 4.0), (-12.0, 4.0)] {
+        let n = 40;
+        let bias = |known: f64| {
+            let mut localiser = localiser();
+            let mut random = Random(5);
+            let errors = (0..n).map(|_| {
+                let at = (31.5 + random.uniform(), 15.5 + random.uniform());
+                let pixels = render_turning(&profile, at, (way_px, turn_px), snr, &mut random);
+                localiser.expect_streak((0.9 * way_px, 0.0));
+                localiser.expect_turn((known * turn_px, 0.0));
+                let guess = (at.0 + random.normal(), at.1 + random.normal());
+                let fix = localiser.locate(&frame(&pixels), Some(guess));
+                fix.x_px - at.0
+            });
+            errors.sum::<f64>() / f64::from(n)
+        };
+        let (unknown, known) = (bias(0.0), bias(0.9));
+        println!("{way_px} px, {turn_px} px: bias {unknown:+.4} px, with the turn known {known:+.4}");
+        let limit = bound(&profile, (way_px, 0.0), snr).0 / f64::from(n).sqrt();
+        assert!(known.abs() < 4.0 * limit + 0.01, "{way_px} {turn_px}: {known} px");
     }
 }
 

@@ -120,6 +120,7 @@ fn run(seed: u64, flow: f64, contact_px: f64, outcome: &mut Outcome) {
         let commanded = Commanded {
             flow_px_per_s: (back_px / DT_S, 0.0),
             streak_px: (back_px / DT_S * EXPOSURE_S, 0.0),
+            turn_px: (0.0, 0.0),
             exposure_s: EXPOSURE_S,
         };
         let t = tracker.step(Some(&frame(&pixels)), f64::from(n) * DT_S, commanded);

@@ -70,11 +70,6 @@ impl Path {
         self
     }
 
-    /// Displacement at which the bead rests, um; commands are counted from `mean_um`.
-    pub(super) fn rest_um(&self, mean_um: f64, gain: f64) -> f64 {
-        mean_um - self.x[1] / (self.x[3] * gain)
-    }
-
     /// Adds a multiple of one state to another: x' = F x, P' = F P F^T.
     fn add(&mut self, to: usize, from: usize, factor: f64) {
         self.x[to] += factor * self.x[from];
@@ -154,14 +149,6 @@ impl Belief {
             quiet: path,
             restless: path,
             odds: [0.0, f64::NEG_INFINITY],
-        }
-    }
-
-    pub(super) fn likelier(&self) -> &Path {
-        if self.odds[1] > self.odds[0] {
-            &self.restless
-        } else {
-            &self.quiet
         }
     }
 

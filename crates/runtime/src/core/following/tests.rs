@@ -61,7 +61,6 @@ fn told(world: &World<'_>) -> Option<Told> {
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
     let mut seen = std::collections::VecDeque::from(vec![0.0; late + 1]);
     let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
-    let mut pause = None;
     for k in 0..(world.seconds * world.rate_hz) as u64 {
         let t = k as f64 * dt;
         let [low_um, high_um] = (world.range)(t);
@@ -91,10 +90,8 @@ fn told(world: &World<'_>) -> Option<Told> {
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
         zero_um -= 8.0 * dt * error_um;
-        command_um = match pause {
-            Some((rest_um, last)) if k <= last => rest_um,
-            _ => zero_um - 0.4 * error_um + (world.added)(t),
-        };
+        let driven_um = zero_um - 0.4 * error_um + (world.added)(t);
+        command_um = following.pause_um().unwrap_or(driven_um);
         command_um = command_um.clamp(0.0, 40.0);
         let found = following.step(&Seen {
             fix: Some((fix_um, 0.015_f64.powi(2))),
@@ -102,12 +99,8 @@ fn told(world: &World<'_>) -> Option<Told> {
             command_um,
             zero_flow_um: zero_um,
         });
-        match found {
-            Some((Instead::Unclear, rest_um)) => {
-                pause = Some((rest_um, k + following.pause_ticks()))
-            }
-            Some((instead, _)) => return Some((t, error_um, instead)),
-            None => {}
+        if let Some((instead, _)) = found {
+            return Some((t, error_um, instead));
         }
     }
     None

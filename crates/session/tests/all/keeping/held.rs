@@ -375,3 +375,7 @@ fn after_of(ticks: &[TickRecord], from_ns: i64) -> impl Iterator<Item = &TickRec
         .iter()
         .filter(move |t| t.time_ns >= from_ns && t.is_running())
 }
+
+pub(super) fn ticks_of(row: &Row, seed: u64) -> Vec<TickRecord> {
+    finish(row, seed, ReferenceSpec::Hold { position_um: 0.0 }).sink.0
+}
