@@ -5,6 +5,7 @@
 //! --help` runs them in the numbers of a night; the tests of this package run a few
 //! of each.
 
+pub mod cameras;
 pub mod inputs;
 pub mod sockets;
 
@@ -335,67 +336,6 @@ pub fn hostile_boards(folder: &Path, tries: u64, chance: &mut Chance) -> Attacke
         }
         attacked.ends_within_range(rig, &what);
         reads(folder, &what, &mut attacked);
-    }
-    attacked
-}
-
-/// Cameras that lose, double, reorder and stall, on the virtual clock: every tick is on the disk or counted.
-pub fn hostile_cameras(folder: &Path, tries: u64, chance: &mut Chance) -> Attacked {
-    let mut attacked = Attacked::default();
-    for number in 0..tries {
-        emptied(folder);
-        let what = format!("camera {number}");
-        let mut share = |most: u64| chance.below(most) as f64 / 1000.0;
-        let mut text = format!(
-            "[emulator]\nseed = {number}\n[emulator.faults]\ndrop_rate = {}\nstale_rate = {}\ndouble_rate = {}\nreorder_rate = {}\n",
-            share(300),
-            share(50),
-            share(500),
-            share(100),
-        );
-        for kind in ["stall-camera", "lose-bead", "double-frames"] {
-            if chance.below(3) == 0 {
-                text.push_str(&format!(
-                    "[[emulator.faults.event]]\nkind = \"{kind}\"\nat_s = {}.5\nfor_s = 0.{}\n",
-                    1 + chance.below(3),
-                    1 + chance.below(9)
-                ));
-            }
-        }
-        std::fs::write(folder.join("hostile.toml"), text).expect("hostile.toml is written");
-        let line = "track --target 1um --rig hostile.toml --duration 5s --clock virtual --frames off --json";
-        let Some(ended) = run(folder, line, &what, &mut attacked) else {
-            continue;
-        };
-        attacked.end(format!("exit {}", ended.code.unwrap_or(-1)));
-        let result: serde_json::Value = serde_json::from_str(&ended.out).unwrap_or_default();
-        let ticks = result["ticks"]
-            .as_u64()
-            .or(result["summary"]["ticks"].as_u64());
-        let lost = result["records_lost"]
-            .as_u64()
-            .or(result["summary"]["records_lost"].as_u64());
-        let Some(run) = only_run(folder) else {
-            if ended.code == Some(0) {
-                attacked.broken.push(format!("{what}: left no run"));
-            }
-            continue;
-        };
-        let line = format!("export {} --out all.csv --force --json", run.display());
-        let rows = self::run(folder, &line, &what, &mut attacked)
-            .and_then(|ended| serde_json::from_str::<serde_json::Value>(&ended.out).ok())
-            .and_then(|export| export["rows"].as_u64());
-        if let (Some(ticks), Some(lost), Some(rows)) = (ticks, lost, rows) {
-            if rows + lost != ticks {
-                attacked.broken.push(format!(
-                    "{what}: {rows} rows and {lost} lost of {ticks} ticks"
-                ));
-            }
-        } else {
-            attacked
-                .broken
-                .push(format!("{what}: no account of ticks: {}", ended.out));
-        }
     }
     attacked
 }

@@ -24,7 +24,7 @@ fn damaged_inputs_get_an_answer() {
 
 #[test]
 fn a_hostile_camera_costs_no_tick_its_record() {
-    stands(attack::hostile_cameras, 5);
+    stands(attack::cameras::hostile_cameras, 6);
 }
 
 #[test]

@@ -110,6 +110,7 @@ impl CellTracker {
             flow_px_per_s,
             streak_px,
             exposure_s,
+            ..
         } = commanded.into();
         if let Some(frame) = frame {
             let way_px = self
