@@ -150,7 +150,10 @@ mod tests {
             // The halves of the way are 2 px shorter and longer than the half of the whole.
             let speed = |pair: &[f32]| (pair[1] - pair[0]) * n as f32;
             let (first, last) = (speed(&along[..2]), speed(&along[n - 2..]));
-            assert!((f64::from(first) - whole_px + 4.0).abs() < 1e-4, "{along:?}");
+            assert!(
+                (f64::from(first) - whole_px + 4.0).abs() < 1e-4,
+                "{along:?}"
+            );
             assert!((f64::from(last) - whole_px - 4.0).abs() < 1e-4, "{along:?}");
         }
     }

@@ -57,6 +57,8 @@ struct Axis {
     ee: f64,
     /// Commanded flow of the frame before, px/s.
     flow: f64,
+    /// Part of the variance of the position that is this bead's alone: its last fix, and its walk since. The rest is of the flow.
+    own: f64,
 }
 
 impl Axis {
@@ -72,6 +74,7 @@ impl Axis {
             ve: 0.0,
             ee: 0.0,
             flow: 0.0,
+            own: var,
         }
     }
 
@@ -90,18 +93,19 @@ impl Axis {
             + way * (2.0 * self.pe + 2.0 * dt_s * self.ve + way * self.ee)
             + 2.0 * r.diffusion_px2_per_s * dt_s
             + half * change * change;
+        self.own += 2.0 * r.diffusion_px2_per_s * dt_s;
         self.pv += dt_s * self.vv + way * self.ve;
         self.pe += dt_s * self.ve + way * self.ee;
         self.vv += r.velocity_walk * r.velocity_walk * dt_s;
     }
 
-    /// Moves on with the flow that has carried it by `way` in `since_s`. The step came at any time in between, so that the speed
-    /// is known to its own size.
+    /// Moves on with the flow that has carried it by `way` in `since_s`. The step came at any time in between: half of the variance of
+    /// the speed is told by the way, and half is that of the time.
     fn carry(&mut self, way: f64, since_s: f64) {
         let (way2, speed) = (way * way, way / since_s);
         self.pp += way2;
         self.pv += way * speed;
-        self.vv += speed * speed;
+        self.vv += 2.0 * speed * speed;
     }
 
     fn update(&mut self, innovation: f64, fix_var: f64) {
@@ -116,6 +120,32 @@ impl Axis {
         self.pv *= 1.0 - kp;
         self.pe *= 1.0 - kp;
         self.pp *= 1.0 - kp;
+        self.own = self.pp;
+    }
+
+    /// Covariance with another bead in the same flow.
+    fn shared(&self, other: &Self) -> f64 {
+        (self.pp - self.own).min(other.pp - other.own).max(0.0)
+    }
+
+    /// The same, now that another bead in the same flow was found `innovation` from its prediction.
+    fn given(&self, other: &Self, innovation: f64, fix_var: f64) -> Self {
+        let shared = self.shared(other);
+        let share = shared / (other.pp + fix_var);
+        Axis {
+            p: self.p + share * innovation,
+            pp: self.pp - share * shared,
+            ..*self
+        }
+    }
+
+    /// The same if the flow has stepped: it has carried both alike.
+    fn carried_with(&self, other: &Self, way: f64, fix_var: f64) -> Self {
+        Axis {
+            p: self.p + way,
+            pp: self.pp + other.pp - 2.0 * self.shared(other) + fix_var,
+            ..*self
+        }
     }
 }
 
@@ -231,12 +261,24 @@ impl Motion {
         self.since_s = 0.0;
     }
 
-    /// The motion as it is predicted when the flow has carried everything this far beside the prediction.
-    pub(super) fn shifted(&self, way_px: (f64, f64)) -> Self {
-        let mut shifted = *self;
-        shifted.x.p += way_px.0;
-        shifted.y.p += way_px.1;
-        shifted
+    /// The motion as it is predicted when a fix was of another bead in the same quiet flow: what is not known of the flow moves both.
+    pub(super) fn given(&self, other: &Self, fix: &Fix) -> Self {
+        let ((x, y), (rx, ry)) = (other.way_to(fix), variances(fix));
+        Motion {
+            x: self.x.given(&other.x, x, rx),
+            y: self.y.given(&other.y, y, ry),
+            ..*self
+        }
+    }
+
+    /// The same when the flow has stepped and carried the other bead to its fix.
+    pub(super) fn carried_with(&self, other: &Self, fix: &Fix) -> Self {
+        let ((x, y), (rx, ry)) = (other.way_to(fix), variances(fix));
+        Motion {
+            x: self.x.carried_with(&other.x, x, rx),
+            y: self.y.carried_with(&other.y, y, ry),
+            ..*self
+        }
     }
 }
 
@@ -281,6 +323,29 @@ mod tests {
             "the window must grow: {}",
             motion.sd_px()
         );
+    }
+
+    #[test]
+    fn a_flow_that_stepped_late_in_a_gap_is_faster_than_the_way_since_the_last_fix() {
+        let randomness = Randomness {
+            diffusion_px2_per_s: 33.0,
+            velocity_walk: 300.0,
+            flow_error: 0.5,
+        };
+        let mut motion = Motion::new(&fix(0.0));
+        for _ in 0..200 {
+            motion.predict(1e-3, (0.0, 0.0), &randomness);
+            motion.update(&fix(0.0));
+        }
+        // The frame of the step shows no bead; the next one shows 10 px of a flow of 10 px a frame, and so does the one after that.
+        motion.predict(1e-3, (0.0, 0.0), &randomness);
+        motion.predict(1e-3, (0.0, 0.0), &randomness);
+        motion.update(&fix(10.0));
+        motion.predict(1e-3, (0.0, 0.0), &randomness);
+        assert!(!motion.has_stepped(&fix(20.0)), "{motion:?}");
+        motion.update(&fix(20.0));
+        motion.predict(1e-3, (0.0, 0.0), &randomness);
+        assert!((motion.position().0 - 30.0).abs() < 1.0, "{motion:?}");
     }
 
     #[test]

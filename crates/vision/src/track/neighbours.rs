@@ -127,29 +127,29 @@ impl Neighbours {
         }
     }
 
-    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden. A flow that has stepped carries all beads
-    /// alike: in that hypothesis the others are looked for as far from their predictions as the chosen one was found.
+    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden. A flow carries all beads alike: the others are
+    /// looked for where they go with the chosen one, in a flow that is quiet and in one that has stepped.
     pub(super) fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
         let own_fix = own.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
         let Some(fix) = own_fix else {
-            return MISS + self.cost_of_others(candidates, None, (0.0, 0.0));
+            return MISS + self.cost_of_others(candidates, None, |n| n.motion);
         };
-        let quiet = ours.quiet_cost(&fix) + self.cost_of_others(candidates, own, (0.0, 0.0));
-        let stepped =
-            ours.step_cost(&fix) + self.cost_of_others(candidates, own, ours.way_to(&fix));
+        let others = |motion: &dyn Fn(&Neighbour) -> Motion| {
+            self.cost_of_others(candidates, own, |n| motion(n))
+        };
+        let quiet = ours.quiet_cost(&fix) + others(&|n| n.motion.given(ours, &fix));
+        let stepped = ours.step_cost(&fix) + others(&|n| n.motion.carried_with(ours, &fix));
         quiet.min(stepped)
     }
 
-    /// Cost of the other beads, all carried by `way_px` from their predictions, and of unknown beads.
+    /// Cost of the other beads, with their motion, and of unknown beads.
     fn cost_of_others(
         &self,
         candidates: &Candidates,
         own: Option<usize>,
-        way_px: (f64, f64),
+        motion: impl Fn(&Neighbour) -> Motion,
     ) -> f64 {
-        let (sights, cost) = self.sights(candidates, own, |n, c| {
-            n.motion.shifted(way_px).surprise(&c.fix)
-        });
+        let (sights, cost) = self.sights(candidates, own, |n, c| motion(n).surprise(&c.fix));
         let unknown = |(k, c): &(usize, &Option<Candidate>)| {
             let is_bead = c.is_some_and(|c| c.fix.verdict == FixQuality::Good);
             is_bead && own != Some(*k) && !sights.contains(&Some(*k))
@@ -210,8 +210,10 @@ impl Neighbours {
         config: &TrackerConfig,
         (width, height): (usize, usize),
     ) {
+        let taken_fix = taken.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
         let (sights, _) = self.sights(candidates, taken, |n, c| {
-            let surprise = n.motion.surprise(&c.fix);
+            let motion = taken_fix.map_or(n.motion, |fix| n.motion.given(ours, &fix));
+            let surprise = motion.surprise(&c.fix);
             let lead = ours.surprise(&c.fix) - surprise;
             if taken.is_none() && lead < config.certainty {
                 f64::INFINITY

@@ -171,9 +171,14 @@ fn a_bead_that_a_command_turns_while_it_is_exposed_is_where_it_was_on_average() 
             errors.sum::<f64>() / f64::from(n)
         };
         let (unknown, known) = (bias(0.0), bias(0.9));
-        println!("{way_px} px, {turn_px} px: bias {unknown:+.4} px, with the turn known {known:+.4}");
+        println!(
+            "{way_px} px, {turn_px} px: bias {unknown:+.4} px, with the turn known {known:+.4}"
+        );
         let limit = bound(&profile, (way_px, 0.0), snr).0 / f64::from(n).sqrt();
-        assert!(known.abs() < 4.0 * limit + 0.01, "{way_px} {turn_px}: {known} px");
+        assert!(
+            known.abs() < 4.0 * limit + 0.01,
+            "{way_px} {turn_px}: {known} px"
+        );
     }
 }
 

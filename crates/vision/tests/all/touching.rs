@@ -25,14 +25,20 @@ fn template() -> Template {
         .expect("a template")
 }
 
-/// A picture of beads that go by `way_px` while the shutter is open.
-fn picture(template: &Template, beads: &[(f64, f64)], way_px: f64, random: &mut Random) -> Vec<u8> {
+/// A picture of beads that go by half of each of `ways_px` before and after the middle of the exposure.
+fn picture(
+    template: &Template,
+    beads: &[(f64, f64)],
+    ways_px: [f64; 2],
+    random: &mut Random,
+) -> Vec<u8> {
     let mut image = vec![110.0_f32; WIDTH * HEIGHT];
     let teeth = 8;
     for (x, y) in beads {
         for k in 0..teeth {
             let at = (f64::from(k) + 0.5) / f64::from(teeth) - 0.5;
             let amplitude = AMPLITUDE / f64::from(teeth);
+            let way_px = ways_px[usize::from(at > 0.0)];
             template.draw(&mut image, WIDTH, x + at * way_px, *y, amplitude);
         }
     }
@@ -67,7 +73,7 @@ fn of_two_beads_that_touch_each_states_its_true_error() {
         for _ in 0..n {
             let at = (60.0 + random.uniform(), 32.0 + random.uniform());
             let beads = [at, (at.0 + apart_px, at.1)];
-            let pixels = picture(&template, &beads, 0.0, &mut random);
+            let pixels = picture(&template, &beads, [0.0; 2], &mut random);
             let starts = beads.map(|(x, y)| Start {
                 place_px: (x + random.normal(), y + random.normal()),
                 contrast: Some((AMPLITUDE, 0.1 * AMPLITUDE)),
@@ -107,16 +113,18 @@ fn run(seed: u64, flow: f64, contact_px: f64, outcome: &mut Outcome) {
     let (mut own, mut apart): ((f64, f64), (f64, f64)) = ((50.0, 32.0), (15.0, 0.0));
     tracker.choose(Some(own));
     let sd = (2.0 * DIFFUSION * DT_S).sqrt();
-    let mut back_px = 0.0;
+    let (mut back_px, mut before_px) = (0.0, 0.0);
     for n in 0..FRAMES {
         let step = if (150..153).contains(&(n % 200)) {
             flow
         } else {
             0.0
         };
+        // Flow and command change in the middle of an exposure.
         let way_px = (step + back_px / DT_S) * EXPOSURE_S;
         let other = (own.0 + apart.0, own.1 + apart.1);
-        let pixels = picture(&template, &[own, other], way_px, &mut random);
+        let ways_px = [std::mem::replace(&mut before_px, way_px), way_px];
+        let pixels = picture(&template, &[own, other], ways_px, &mut random);
         let commanded = Commanded {
             flow_px_per_s: (back_px / DT_S, 0.0),
             streak_px: (back_px / DT_S * EXPOSURE_S, 0.0),
