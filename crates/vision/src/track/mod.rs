@@ -337,7 +337,8 @@ impl Tracker {
         if let Some(fix) = taken_fix
             && chosen.motion.has_stepped(&fix)
         {
-            self.neighbours.carry(chosen.motion.way_to(&fix));
+            let motion = chosen.motion;
+            (self.neighbours).carry(motion.way_to(&fix), motion.since_s());
         }
         self.neighbours.update(
             &chosen.motion,

@@ -192,10 +192,14 @@ impl Neighbours {
         (sights, cost)
     }
 
-    /// Goes along with a step of the flow that has carried the chosen bead this far.
-    pub(super) fn carry(&mut self, way_px: (f64, f64)) {
+    /// Goes along with a step of the flow that has carried the chosen bead this far in `since_s`: each as far as it went at that speed
+    /// since it was seen itself.
+    pub(super) fn carry(&mut self, (x_px, y_px): (f64, f64), since_s: f64) {
         for n in self.beads.iter_mut().flatten() {
-            n.motion.carry(way_px);
+            let share = n.motion.since_s() / since_s;
+            if share.is_finite() {
+                n.motion.carry((share * x_px, share * y_px));
+            }
         }
     }
 
