@@ -132,9 +132,7 @@ impl Controller {
             ControllerConfig::Pi(pi) => {
                 Self::with_law(config.with(PiLaw::new(pi, model.sample_time_s)?))
             }
-            ControllerConfig::Lqg(lqg) => {
-                Self::with_law(config.with(LqgLaw::new(&lqg, model)?))
-            }
+            ControllerConfig::Lqg(lqg) => Self::with_law(config.with(LqgLaw::new(&lqg, model)?)),
             ControllerConfig::Mpc(mpc, pi) => {
                 let law = MpcLaw::new(&mpc, pi, model, &config.limits)?;
                 Self::with_law(config.with(law))

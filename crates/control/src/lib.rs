@@ -83,10 +83,10 @@ pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
 pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind, TimedSolve};
-pub use path::PathState;
 pub use partner::{
     Partner, PartnerConfig, PartnerInput, PartnerOutput, PartnerState, PartnerStatus, Probe,
 };
+pub use path::PathState;
 pub use pi::{Lead, Pi, PiLaw, PiState};
 pub use plant_estimate::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};

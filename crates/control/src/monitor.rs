@@ -341,8 +341,7 @@ fn judge(now: &PlantEstimate, baseline: &PlantEstimate) -> PlantVerdict {
     }
     let jumped = !(1.0 / JUMP..=JUMP).contains(&ratio);
     // A smooth motion tells little of a lag: what may be one by chance is none.
-    let lags =
-        lag.abs() >= 0.5 * BUBBLE_MS && sure(lag.abs(), now.lag_sd_ms, baseline.lag_sd_ms);
+    let lags = lag.abs() >= 0.5 * BUBBLE_MS && sure(lag.abs(), now.lag_sd_ms, baseline.lag_sd_ms);
     if jumped && !lags && sure(fall.abs(), now.gain_sd, baseline.gain_sd) {
         return PlantVerdict::Constriction;
     }

@@ -90,7 +90,10 @@ fn most_um(time_s: f64, troubles: &[Trouble]) -> f64 {
 /// What the last word says, against the truth.
 fn judge(rows: &[Row], troubles: &[Trouble], code: Option<i32>, result: &Value) -> Vec<String> {
     let mut broken = Vec::new();
-    let settled = || rows.iter().filter(|row| row.running && row.time_s > SETTLED_S);
+    let settled = || {
+        rows.iter()
+            .filter(|row| row.running && row.time_s > SETTLED_S)
+    };
     let strays = settled().find(|row| row.off_um.abs() > most_um(row.time_s, troubles));
     let kind = result["ended"]["kind"].as_str().unwrap_or_default();
     let said = format!("exit {code:?}, {kind:?}");
@@ -119,7 +122,8 @@ fn judge(rows: &[Row], troubles: &[Trouble], code: Option<i32>, result: &Value) 
 /// Every tick is on the disk or counted.
 fn account(rows: Option<u64>, ended: &Ended, result: &Value) -> Option<String> {
     let count = |name: &str| result[name].as_u64().or(result["summary"][name].as_u64());
-    let (Some(ticks), Some(lost), Some(rows)) = (count("ticks"), count("records_lost"), rows) else {
+    let (Some(ticks), Some(lost), Some(rows)) = (count("ticks"), count("records_lost"), rows)
+    else {
         return Some(format!("no account of ticks: {}", ended.out));
     };
     (rows + lost != ticks).then(|| format!("{rows} rows and {lost} lost of {ticks} ticks"))

@@ -35,7 +35,12 @@ fn main() -> ExitCode {
             attack::inputs::damaged_inputs,
         ),
         ("hostile boards", "--boards", 100, attack::hostile_boards),
-        ("hostile cameras", "--cameras", 60, attack::cameras::hostile_cameras),
+        (
+            "hostile cameras",
+            "--cameras",
+            60,
+            attack::cameras::hostile_cameras,
+        ),
         (
             "hostile camera lines",
             "--lines",

@@ -114,7 +114,11 @@ mod tests {
 
     #[test]
     fn a_fix_that_was_not_the_bead_s_leaves_the_pzt_where_it_was() {
-        let thrown = [([20.0, 22.6], -0.99), ([22.6, 21.0], 0.99), ([21.0, 20.4], 0.38)];
+        let thrown = [
+            ([20.0, 22.6], -0.99),
+            ([22.6, 21.0], 0.99),
+            ([21.0, 20.4], 0.38),
+        ];
         assert!((stops(thrown) - 20.0).abs() < 0.01);
     }
 

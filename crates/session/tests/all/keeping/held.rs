@@ -9,8 +9,8 @@ use cellpos_session::setup::ReferenceSpec;
 use cellpos_session::{Finished, Options, Rig, RigFile};
 use std::fmt;
 
-/// Gain of Eq. (6) at the frequencies of a hold, 1/s.
-pub(super) const GAIN_PER_S: f64 = 379.0;
+/// Speed of the flow in the end for a zero flow that is 1 um off, Eq. (6), 1/s: it begins with 379 of them.
+pub(super) const GAIN_PER_S: f64 = 428.0;
 /// Where the bead rests before a step of the flow, um; it wanders by some nm.
 const ZERO_FLOW_UM: f64 = 20.0;
 /// Start of the first event, and its errors count from there, s.
@@ -374,8 +374,4 @@ fn after_of(ticks: &[TickRecord], from_ns: i64) -> impl Iterator<Item = &TickRec
     ticks
         .iter()
         .filter(move |t| t.time_ns >= from_ns && t.is_running())
-}
-
-pub(super) fn ticks_of(row: &Row, seed: u64) -> Vec<TickRecord> {
-    finish(row, seed, ReferenceSpec::Hold { position_um: 0.0 }).sink.0
 }

@@ -117,12 +117,12 @@ fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sig
 }
 
 #[test]
-fn steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms_under_the_laws_that_know_them_in_advance() {
+fn steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms_under_every_law() {
     for (law, count, most_ms) in [
         ("lqg", 100, 12.0),
         ("mpc", 20, 12.0),
-        ("pi", 20, 60.0),
-        ("own", 20, 60.0),
+        ("pi", 100, 12.0),
+        ("own", 20, 12.0),
     ] {
         let steps = steps::go(law, 1, count);
         let worst_ms = steps.settled_ms.iter().copied().fold(0.0, f64::max);
@@ -168,28 +168,4 @@ fn keeping_table() {
         .collect();
     let broken = table(&rows, seeds, &Limits::of_the_loop());
     assert!(broken.is_empty(), "{broken:#?}");
-}
-
-#[test]
-#[ignore = "scratch"]
-fn scratch_dump() {
-    let var = |name: &str| std::env::var(name).unwrap_or_default();
-    let seed: u64 = var("KEEP_SEED").parse().unwrap();
-    let rows: Vec<Row> = rows::all()
-        .into_iter()
-        .filter(|row| row.to_string().contains(&var("KEEPING_ROWS")))
-        .collect();
-    let from: f64 = var("KEEP_FROM").parse().unwrap_or(2590.0);
-    let to: f64 = var("KEEP_TO").parse().unwrap_or(2660.0);
-    println!("{}", rows[0]);
-    for t in held::ticks_of(&rows[0], seed) {
-        let ms = t.time_ns as f64 * 1e-6;
-        if ms >= from && ms <= to {
-            println!(
-                "{ms:.1} true {:.3} meas {:.3} sd {:.4} est {:.3} dec {:?} verdict {} track {} n {:.3} cmd {:.3} app {:.3} life {} flags {:?}",
-                t.true_um, t.measured_um, t.variance_um2.sqrt(), t.estimate_um,
-                cellpos_vision::Decision::from_number(t.decision), t.verdict, t.track, t.neutral_um, t.command_um, t.applied_um, t.life, t.flags
-            );
-        }
-    }
 }
