@@ -57,8 +57,11 @@ struct Axis {
     ee: f64,
     /// Commanded flow of the frame before, px/s.
     flow: f64,
-    /// Part of the variance of the position that is this bead's alone: its last fix, and its walk since. The rest is of the flow.
-    own: f64,
+    /// Parts of pp, pv and vv that are of the flow and not of this bead alone: what is not known of the commanded one, and of one that
+    /// has stepped.
+    flow_pp: f64,
+    flow_pv: f64,
+    flow_vv: f64,
 }
 
 impl Axis {
@@ -74,7 +77,9 @@ impl Axis {
             ve: 0.0,
             ee: 0.0,
             flow: 0.0,
-            own: var,
+            flow_pp: 0.0,
+            flow_pv: 0.0,
+            flow_vv: 0.0,
         }
     }
 
@@ -89,11 +94,12 @@ impl Axis {
         let way = dt_s * flow;
         let change = dt_s * (flow - std::mem::replace(&mut self.flow, flow));
         self.p += dt_s * self.v + way * (1.0 + self.e);
-        self.pp += dt_s * (2.0 * self.pv + dt_s * self.vv)
-            + way * (2.0 * self.pe + 2.0 * dt_s * self.ve + way * self.ee)
-            + 2.0 * r.diffusion_px2_per_s * dt_s
-            + half * change * change;
-        self.own += 2.0 * r.diffusion_px2_per_s * dt_s;
+        let wrong =
+            way * (2.0 * self.pe + 2.0 * dt_s * self.ve + way * self.ee) + half * change * change;
+        self.pp +=
+            dt_s * (2.0 * self.pv + dt_s * self.vv) + 2.0 * r.diffusion_px2_per_s * dt_s + wrong;
+        self.flow_pp += dt_s * (2.0 * self.flow_pv + dt_s * self.flow_vv) + wrong.max(0.0);
+        self.flow_pv += dt_s * self.flow_vv;
         self.pv += dt_s * self.vv + way * self.ve;
         self.pe += dt_s * self.ve + way * self.ee;
         self.vv += r.velocity_walk * r.velocity_walk * dt_s;
@@ -106,6 +112,9 @@ impl Axis {
         self.pp += way2;
         self.pv += way * speed;
         self.vv += 2.0 * speed * speed;
+        self.flow_pp += way2;
+        self.flow_pv += way * speed;
+        self.flow_vv += 2.0 * speed * speed;
     }
 
     fn update(&mut self, innovation: f64, fix_var: f64) {
@@ -114,18 +123,21 @@ impl Axis {
         self.p += kp * innovation;
         self.v += kv * innovation;
         self.e += ke * innovation;
+        let vv = self.vv;
         self.vv -= kv * self.pv;
         self.ve -= kv * self.pe;
         self.ee -= ke * self.pe;
         self.pv *= 1.0 - kp;
         self.pe *= 1.0 - kp;
         self.pp *= 1.0 - kp;
-        self.own = self.pp;
+        (self.flow_pp, self.flow_pv) = (0.0, 0.0);
+        self.flow_vv *= (self.vv / vv).clamp(0.0, 1.0);
     }
 
     /// Covariance with another bead in the same flow.
     fn shared(&self, other: &Self) -> f64 {
-        (self.pp - self.own).min(other.pp - other.own).max(0.0)
+        let most = self.flow_pp.min(other.flow_pp);
+        most.min(self.pp).min(other.pp).max(0.0)
     }
 
     /// The same, now that another bead in the same flow was found `innovation` from its prediction.
