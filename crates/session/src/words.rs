@@ -209,10 +209,7 @@ fn text(kind: &EventKind) -> String {
         EventKind::StuckStarted => "The bead does not follow the PZT: it sticks.".to_string(),
         EventKind::StuckEnded { lasted_ms } => ended("The bead follows again", lasted_ms),
         EventKind::SaturationStarted => "The PZT is at an end of its range.".to_string(),
-        EventKind::LoopPaused { count } => {
-            let pauses = plural(u64::from(count), "pause", "pauses");
-            format!("{count} {pauses} of the loop: the bead seemed to move against the commands.")
-        }
+        EventKind::LoopPaused { count } => paused(count),
         EventKind::ActuatorClipped { level_um } => format!(
             "The bead does not follow the commands beyond about {level_um:.1} um: the amplifier or the PZT is clipped."
         ),
@@ -244,6 +241,11 @@ fn text(kind: &EventKind) -> String {
         EventKind::Script { stage } => format!("Script: {}.", stage.name()),
         EventKind::StepSkipped => "The operator skipped to the next step.".to_string(),
     }
+}
+
+fn paused(count: u32) -> String {
+    let pauses = plural(u64::from(count), "pause", "pauses");
+    format!("{count} {pauses} of the loop: the bead seemed to move against the commands.")
 }
 
 /// What the slow actuator does.
