@@ -44,7 +44,11 @@ pub(crate) fn run(args: Args) -> CommandResult {
     } else {
         print_text(&text(&examined))?;
     }
-    Ok(if examined.fit { Outcome::Done } else { Outcome::Broken })
+    Ok(if examined.fit {
+        Outcome::Done
+    } else {
+        Outcome::Broken
+    })
 }
 
 fn text(report: &Examination) -> String {
