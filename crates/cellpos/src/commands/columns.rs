@@ -5,7 +5,7 @@ use crate::outcome::Failure;
 use cellpos_reconcile::Record;
 use cellpos_table::{ColumnRef, Table};
 use cellpos_units::Hertz;
-use cellpos_workbench::experiment::collect::{EXPOSURE, FRAME_AGE, refused};
+use cellpos_workbench::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, refused};
 use std::path::Path;
 
 /// Columns of a record, and how they are to be taken.
@@ -67,9 +67,12 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
     // What a loop knows of its frames stands beside position and command.
     let beside = |name: &str| table.numbers_or_nan(&ColumnRef::from(name)).ok();
     let (mut age, exposure) = (beside(FRAME_AGE).unwrap_or_default(), beside(EXPOSURE));
+    let mut came = beside(FRAME_CAME).unwrap_or_default();
     if let Some(rows) = wanted.rows {
         let range = range_of(rows, u.len())?;
-        age = (age.get(range.clone())).map_or_else(Vec::new, <[f64]>::to_vec);
+        for values in [&mut age, &mut came] {
+            *values = (values.get(range.clone())).map_or_else(Vec::new, <[f64]>::to_vec);
+        }
         (u, y, t) = (
             u[range.clone()].to_vec(),
             y[range.clone()].to_vec(),
@@ -84,8 +87,10 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
         .collect();
     let pick = |values: &[f64]| known.iter().map(|&k| values[k]).collect::<Vec<_>>();
     let (mut u, mut y, mut t) = (pick(&u), pick(&y), pick(&t));
-    if !age.is_empty() {
-        age = pick(&age);
+    for values in [&mut age, &mut came] {
+        if !values.is_empty() {
+            *values = pick(values);
+        }
     }
     if let Some(even) = evened(&t, &u, &y, wanted.held) {
         tracing::warn!(
@@ -95,6 +100,7 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
         );
         (t, u, y) = even;
         age.clear();
+        came.clear();
     }
     let name = path.file_stem().map_or_else(
         || path.display().to_string(),
@@ -104,6 +110,12 @@ pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> 
     if wanted.held {
         hold_over_gaps(&mut record);
         record.frame_age_s = in_rows(&record, &t, &age);
+        let came = in_rows(&record, &t, &came);
+        if !came.is_empty() {
+            record.unseen = (came.iter().zip(&record.bead_um))
+                .map(|(came, bead)| *came == 1.0 && bead.is_nan())
+                .collect();
+        }
         let exposure = exposure.iter().flatten().find(|s| s.is_finite());
         record.exposure_s = exposure.map_or(0.0, |s| s.max(0.0));
     }

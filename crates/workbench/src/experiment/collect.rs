@@ -166,11 +166,19 @@ pub const FRAME_AGE: &str = "frame_age_s";
 /// Column of a record with the exposure of its frames.
 pub const EXPOSURE: &str = "exposure_s";
 
+/// Column of a record with 1 where a row's frame came, with a bead or without, and 0 where it was dropped.
+pub const FRAME_CAME: &str = "frame_came";
+
 /// Writes a record as the CSV that every command reads.
 pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
     let mut more = Vec::new();
     if !record.frame_age_s.is_empty() {
         more.push((FRAME_AGE.to_owned(), record.frame_age_s.clone()));
+    }
+    if record.unseen.contains(&true) {
+        let came = (record.unseen.iter().zip(&record.bead_um))
+            .map(|(unseen, bead)| f64::from(u8::from(*unseen || bead.is_finite())));
+        more.push((FRAME_CAME.to_owned(), came.collect()));
     }
     if record.exposure_s > 0.0 {
         more.push((EXPOSURE.to_owned(), vec![record.exposure_s; record.rows()]));

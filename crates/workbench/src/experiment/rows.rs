@@ -22,6 +22,14 @@ pub fn is_unseen(tick: &TickRecord) -> bool {
     came && !tick.measured_um.is_finite()
 }
 
+/// Frames that came with a tick's frame and were not used: they were late, for example after a stall of the camera, but not dropped.
+pub fn frames_passed_over(tick: &TickRecord) -> usize {
+    match is_new_frame(tick) {
+        true => usize::from(tick.drained).saturating_sub(1),
+        false => 0,
+    }
+}
+
 /// Spans that are over.
 pub(crate) fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
     let is_running = |t: &&TickRecord| t.is_running();
@@ -42,7 +50,7 @@ pub(crate) struct Rows {
     skipped: Vec<bool>,
     /// The command of this row's tick came late, or never.
     late: Vec<bool>,
-    /// The frame came, without a bead to be trusted.
+    /// The frame came, too late or without a bead to be trusted.
     pub(crate) unseen: Vec<bool>,
     /// Age of each row's frame, ns, where it came in time.
     ages_ns: Vec<Option<i64>>,
@@ -176,6 +184,7 @@ impl Rows {
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
+            rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
             rows.usable[row] = tick.is_controlled();
             // A tick that was skipped, or whose record was lost, leaves its place to the one behind it.
             let at = usize::try_from(grid.index(tick.time_ns) - first_index).unwrap_or(0);

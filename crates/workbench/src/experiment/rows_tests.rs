@@ -156,3 +156,29 @@ fn ticks_that_are_late_or_skipped_and_a_camera_that_drifts_bend_neither_gain_nor
         }
     }
 }
+
+#[test]
+fn frames_that_a_stall_kept_back_are_late_and_not_dropped() {
+    let calm = Lateness {
+        most_ns: 0.0,
+        skipped: 0.0,
+        drift: 0.0,
+    };
+    let mut ticks = ticks(10.0, 200, &calm);
+    let (stalled, dropped) = (50..60, 120);
+    // A timer stands in while the camera stalls. Then all frames come at once.
+    for tick in &mut ticks[stalled.clone()] {
+        tick.flags.set(TickFlags::TIMER);
+        tick.verdict = 255;
+        tick.measured_um = f64::NAN;
+    }
+    ticks[stalled.end].drained = 1 + stalled.len() as u8;
+    ticks.remove(dropped);
+    let rows = Rows::of(&ticks, PERIOD_NS);
+    let missing = |k: usize| rows.output[k].is_nan() && !rows.unseen[k];
+    assert!(stalled.clone().all(|k| rows.output[k].is_nan()));
+    assert_eq!(
+        (0..200).filter(|&k| missing(k)).collect::<Vec<_>>(),
+        [dropped]
+    );
+}

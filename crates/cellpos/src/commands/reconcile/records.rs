@@ -9,7 +9,7 @@ use cellpos_reconcile::Record;
 use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
 use cellpos_workbench::experiment::collect::{neutral_um, refused};
-use cellpos_workbench::experiment::on_rig::{frame_age_ns, is_unseen};
+use cellpos_workbench::experiment::on_rig::{frame_age_ns, frames_passed_over, is_unseen};
 use std::path::{Path, PathBuf};
 
 /// Where CSV files have what, and in which units.
@@ -133,10 +133,11 @@ pub(super) fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
     for tick in run.batches().map_err(Failure::input)?.flatten() {
         let first_seq = *first_seq.get_or_insert(tick.seq);
         let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
-        if is_unseen(&tick)
-            && let Some(unseen) = read.unseen.get_mut(row)
-        {
-            *unseen = true;
+        // The frames passed over, and its own.
+        let came =
+            row.saturating_sub(frames_passed_over(&tick))..row + usize::from(is_unseen(&tick));
+        if let Some(unseen) = read.unseen.get_mut(came) {
+            unseen.fill(true);
         }
         if let Some(age_ns) = frame_age_ns(&tick)
             && let Some(age_s) = read.frame_age_s.get_mut(row)
