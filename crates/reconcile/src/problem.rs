@@ -1,12 +1,12 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
 use crate::data::free::Free;
-use crate::data::motion::parabola;
+use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
 use crate::data::waits::waits;
 use crate::dot::dot;
-use crate::simulate::{Base, Sampling};
+use crate::simulate::{Base, Sampling, simulate};
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 use std::sync::Arc;
@@ -51,9 +51,11 @@ pub(crate) struct Prepared {
     pub sampling: Sampling,
     /// Motions by which the plant may come to rest from where it was before the record, as they are.
     transients: Vec<Vec<f64>>,
-    /// Path of a drift of the zero flow, if the noise has one.
-    parabola: Option<Vec<f64>>,
-    /// Transients and path in the space of innovations.
+    /// Where a zero flow that is off, and one that drifts, take the bead.
+    flow: FlowPaths,
+    /// Whether the noise has a zero flow that drifts.
+    drifts: bool,
+    /// Transients and paths in the space of innovations.
     free: Free,
 }
 
@@ -72,20 +74,16 @@ impl Prepared {
     }
 
     /// The filter of a noise, and orthonormal innovations of the transients under it.
-    fn set_noise(&mut self, base: &Base, noise: &NoiseModel) {
+    fn set_noise(&mut self, noise: &NoiseModel) {
         self.whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
-        self.transients = transients(base, self.u.len());
-        self.parabola = noise
-            .zero_flow
-            .is_some_and(|z| z.drifts())
-            .then(|| parabola(self.u.len()));
-        self.free = Free::new(noise, &self.whitener, &self.transients, self.u.len());
+        self.drifts = noise.zero_flow.is_some();
+        self.free = Free::new(noise, &self.whitener, &self.transients, &self.flow);
     }
 
     /// Twice the negative log-likelihood of a residual under another noise, without a constant.
     pub(crate) fn unlikelihood(&self, noise: &NoiseModel, residual: &[f64]) -> f64 {
         let whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
-        let free = Free::new(noise, &whitener, &self.transients, residual.len());
+        let free = Free::new(noise, &whitener, &self.transients, &self.flow);
         let mut e = vec![0.0; residual.len()];
         whitener.apply(residual, &mut e);
         free.take_off(&mut e);
@@ -99,7 +97,10 @@ impl Prepared {
         if ramp {
             columns.push((0..n).map(|k| k as f64 / n as f64 - 0.5).collect());
         }
-        columns.extend(self.transients.iter().chain(&self.parabola).cloned());
+        columns.extend(self.transients.iter().cloned());
+        if self.drifts {
+            columns.push(self.flow.drift.clone());
+        }
         let mut basis: Vec<Vec<f64>> = Vec::new();
         let mut left = residual.to_vec();
         let blank = |v: &mut Vec<f64>| {
@@ -128,22 +129,12 @@ impl Prepared {
     }
 }
 
-/// Time constants of the free decays over the length of a record, half a decade apart. Faster decays are over at once, slower ones are
-/// a ramp.
-const DECAYS: [f64; 5] = [0.003, 0.01, 0.03, 0.1, 0.3];
-
-/// Free motions of a record. A plant that did not rest before the record: the decays of its poles. An unknown working point: a ramp, and
-/// the decays with which a chain with memory (a leak, a relaxation, a creep) goes from its unknown start to the first command.
-fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
+/// Free motions of a record: of an unknown working point that of a zero flow that is off; of a plant that did not rest before the record
+/// the decays of its poles.
+fn transients(base: &Base, flow: &FlowPaths, rows: usize) -> Vec<Vec<f64>> {
     let mut all = Vec::new();
     if base.free_working_point {
-        // An error of the working point gives an integrating plant a ramp.
-        all.push((0..rows).map(|k| k as f64).collect());
-        let decay = |part: f64| -> Vec<f64> {
-            let of = |k: usize| (-(k as f64) / (part * rows as f64)).exp();
-            (0..rows).map(of).collect()
-        };
-        all.extend(DECAYS.map(decay));
+        all.push(flow.off.clone());
     }
     if !base.free_start {
         return all;
@@ -168,6 +159,21 @@ fn transients(base: &Base, rows: usize) -> Vec<Vec<f64>> {
         }
     }
     all
+}
+
+/// Where a zero flow takes the bead through the plant alone.
+fn flow_paths(base: &Base, rows: usize) -> FlowPaths {
+    let mut off = Vec::new();
+    simulate(
+        base,
+        (&vec![1.0; rows], &Sampling::default()),
+        &[],
+        &mut off,
+        None,
+    );
+    let motion_per_um = base.speed_per_um() * base.sample_s;
+    off.iter_mut().for_each(|y| *y /= motion_per_um);
+    FlowPaths::new(off)
 }
 
 /// Everything that fits share.
@@ -231,9 +237,11 @@ impl Problem {
                     .collect();
                 let extra_walk = uncertain_command(r, velocity * base.sample_s);
                 let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
+                let flow = flow_paths(&base, r.rows());
                 let mut prepared = Prepared {
-                    transients: Vec::new(),
-                    parabola: None,
+                    transients: transients(&base, &flow, r.rows()),
+                    flow,
+                    drifts: false,
                     free: Free::default(),
                     name: r.name.clone(),
                     u,
@@ -247,7 +255,7 @@ impl Problem {
                         waits_s,
                     },
                 };
-                prepared.set_noise(&base, &noise);
+                prepared.set_noise(&noise);
                 prepared
             })
             .collect();
@@ -275,7 +283,7 @@ impl Problem {
     pub(crate) fn with_noise(mut self, noise: NoiseModel) -> Self {
         self.noise = noise;
         for r in &mut self.records {
-            r.set_noise(&self.base, &noise);
+            r.set_noise(&noise);
         }
         self
     }
@@ -289,6 +297,12 @@ impl Problem {
     pub(crate) fn log_determinant(&self) -> f64 {
         let of = |r: &Prepared| r.whitener.log_determinant() + r.free.log_determinant();
         self.records.iter().map(of).sum()
+    }
+
+    /// Twice the negative log-likelihood of residuals under another noise, without a constant.
+    pub(crate) fn unlikelihood(&self, noise: &NoiseModel, residuals: &[Vec<f64>]) -> f64 {
+        let of = |(r, residual): (&Prepared, &Vec<f64>)| r.unlikelihood(noise, residual);
+        self.records.iter().zip(residuals).map(of).sum()
     }
 
     /// All rows.

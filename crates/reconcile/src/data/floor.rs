@@ -5,6 +5,7 @@ use crate::data::coloured::{Alone, NoiseKind, choose};
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
 use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
+use crate::data::zero_flow::descend;
 use crate::thresholds::THRESHOLDS;
 use serde::Serialize;
 use std::f64::consts::TAU;
@@ -250,21 +251,27 @@ fn quantisation_um2(records: &[Record]) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// From the innovations' own model: increments of the raw residuals of a fit that is believed.
-pub(crate) fn from_residuals(present: &[Vec<bool>], residuals: &[Vec<f64>]) -> NoiseModel {
-    let (mut c0, mut c1, mut n) = (0.0, 0.0, 0.0);
-    for (p, e) in present.iter().zip(residuals) {
-        let (a, b, m) = increment_moments(e, p);
-        c0 += a * m as f64;
-        c1 += b * m as f64;
-        n += m as f64;
-    }
-    if n == 0.0 {
-        NoiseModel::new(0.33, 1e-3, 0.03)
-    } else {
-        NoiseModel::from_increments(c0 / n, c1 / n)
-    }
+/// A noise with the walk and the white noise of the greatest likelihood; `unlikelihood` is twice the negative log-likelihood of what a fit
+/// leaves. Increments alone would take a zero flow that drifts for a walk.
+pub(crate) fn refined(noise: &NoiseModel, unlikelihood: impl Fn(&NoiseModel) -> f64) -> NoiseModel {
+    // Shares of the increments' variance that white noise may have, as [`NoiseModel::from_increments`] has them.
+    const LEAST: f64 = -0.25;
+    const RANGE: f64 = 0.7495;
+    let of = |[size, share]: [f64; 2]| {
+        let variance = size.exp();
+        let white = variance * (LEAST + RANGE / (1.0 + (-share).exp()));
+        NoiseModel {
+            coloured: noise.coloured,
+            zero_flow: noise.zero_flow,
+            ..NoiseModel::from_increments(variance, -white)
+        }
+    };
+    let variance = noise.walk_um2 + 2.0 * noise.white_um2;
+    let share = ((noise.white_um2 / variance - LEAST) / RANGE).clamp(1e-3, 1.0 - 1e-3);
+    let begun = [variance.ln(), (share / (1.0 - share)).ln()];
+    of(descend(begun, 2e-3, |x| unlikelihood(&of(x))))
 }
+
 /// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
 pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
     let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);

@@ -1,6 +1,6 @@
 //! Motions of a record that are of any size (its level, its start) or of a size with a prior (a drift), in the space of innovations.
 
-use crate::data::motion::parabola;
+use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::dot::dot;
 
@@ -17,7 +17,7 @@ impl Free {
         noise: &NoiseModel,
         whitener: &Whitener,
         transients: &[Vec<f64>],
-        rows: usize,
+        flow: &FlowPaths,
     ) -> Self {
         let mut free = Self::default();
         for t in transients {
@@ -30,9 +30,10 @@ impl Free {
             return free;
         }
         // The working point is as old as the record is long, or older: since then the zero flow drifted by as much again.
-        let ramp = (0..rows).map(|k| (k as f64 - 0.5 * (rows as f64 - 1.0)) * rows as f64);
-        for path in [parabola(rows), ramp.collect()] {
-            if let Some((q, size)) = free.direction(whitener, &path) {
+        let rows = flow.off.len() as f64;
+        let off: Vec<f64> = flow.off.iter().map(|y| y * rows).collect();
+        for path in [&flow.drift, &off] {
+            if let Some((q, size)) = free.direction(whitener, path) {
                 // The drift adds to the variance along its direction. Squares there count 1 / variance.
                 let variance = 1.0 + (drift_um * size).powi(2);
                 free.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
@@ -92,14 +93,15 @@ mod tests {
         };
         let y = [0.0, 0.03, 0.11];
         let whitener = Whitener::new(&noise, &[true; 3], None);
-        let free = Free::new(&noise, &whitener, &[], 3);
+        let flow = FlowPaths::new(vec![0.0, 1.0, 2.0]);
+        let free = Free::new(&noise, &whitener, &[], &flow);
         let mut e = [0.0; 3];
         whitener.apply(&y, &mut e);
         free.take_off(&mut e);
         let squares: f64 = e.iter().map(|e| e * e).sum();
 
-        // Motions of the parabola in the two increments, and of the ramp: 3 in both.
-        let path = parabola(3);
+        // Motions of the drift in the two increments, and of the zero flow that is off: 3 in both.
+        let path = &flow.drift;
         let (a, b) = (path[1] - path[0], path[2] - path[1]);
         let (q, d) = (noise.walk_um2, 0.05f64.powi(2));
         let covariance = [

@@ -8,7 +8,7 @@ pub struct ZeroFlow {
     pub motion_um2: f64,
     /// Its correlation time \[rows\].
     pub time_rows: f64,
-    /// Standard deviation of a steady change of the motion from row to row, different in each record \[um\]; 0: no drift.
+    /// Standard deviation of a steady change of the motion from row to row, different in each record \[um\].
     pub drift_um: f64,
 }
 
@@ -21,11 +21,6 @@ impl ZeroFlow {
     /// Variance gained in a row.
     pub(super) fn fresh_um2(&self) -> f64 {
         -(-2.0 / self.time_rows).exp_m1() * self.motion_um2
-    }
-
-    /// Whether it drifts as well.
-    pub fn drifts(&self) -> bool {
-        self.drift_um > 0.0
     }
 
     /// Mean square of its path over `rows`, about the mean or, with `ramp`, about its regression line \[um^2\].
@@ -42,8 +37,28 @@ impl ZeroFlow {
     }
 }
 
-/// The path of a motion that changes by one from row to row.
-pub(crate) fn parabola(rows: usize) -> Vec<f64> {
-    let of = |k: usize| 0.5 * (k as f64 - 0.5 * (rows as f64 - 1.0)).powi(2);
-    (0..rows).map(of).collect()
+/// Where a zero flow takes a bead in a record.
+#[derive(Debug, Clone)]
+pub(crate) struct FlowPaths {
+    /// Of one that is off by one motion in a row \[um\].
+    pub off: Vec<f64>,
+    /// Of one that drifts by one motion in a row in every row, and is right in the middle of the record \[um\].
+    pub drift: Vec<f64>,
+}
+
+impl FlowPaths {
+    /// With the path of one that is off; that of a drift is its sum, whatever the plant.
+    pub(crate) fn new(off: Vec<f64>) -> Self {
+        let middle = 0.5 * (off.len() as f64 - 1.0);
+        let mut sum = 0.0;
+        let drift = off.iter().map(|y| {
+            let at = sum + 0.5 * y - middle * y;
+            sum += y;
+            at
+        });
+        Self {
+            drift: drift.collect(),
+            off,
+        }
+    }
 }

@@ -5,7 +5,6 @@
 
 use crate::data::motion::ZeroFlow;
 use crate::data::noise::NoiseModel;
-use crate::thresholds::NUMBER;
 
 /// Zero flow of syringe, tube and reservoir (95 %): a displacement of 1 to 50 nm RMS with a correlation time of 3 to 100 s. Median, and
 /// standard deviation of the logarithm. Without this prior a leak is mistaken for a zero flow that follows the command.
@@ -32,13 +31,12 @@ impl Prior {
     }
 
     /// The zero flow at a number of standard deviations from the medians of displacement and time.
-    fn at(&self, [size, time]: [f64; 2], drifts: bool) -> ZeroFlow {
+    fn at(&self, [size, time]: [f64; 2]) -> ZeroFlow {
         let displacement_um = DISPLACEMENT_UM.0 * (DISPLACEMENT_UM.1 * size).exp();
-        let drift_um = DRIFT_UM_PER_S * self.sample_s * self.motion_per_um;
         ZeroFlow {
             motion_um2: (displacement_um * self.motion_per_um).powi(2),
             time_rows: TIME_S.0 * (TIME_S.1 * time).exp() / self.sample_s,
-            drift_um: if drifts { drift_um } else { 0.0 },
+            drift_um: DRIFT_UM_PER_S * self.sample_s * self.motion_per_um,
         }
     }
 
@@ -52,12 +50,42 @@ impl Prior {
         ]
     }
 
-    /// Cost of a zero flow in twice the log-likelihood: two numbers, and their distance from the medians.
-    pub(crate) fn price(&self, z: Option<&ZeroFlow>) -> f64 {
-        z.map_or(0.0, |z| {
-            let off: f64 = self.of(z).iter().map(|x| x * x).sum();
-            off + NUMBER * self.of(z).len() as f64
-        })
+    fn noise_at(&self, noise: &NoiseModel, x: [f64; 2]) -> NoiseModel {
+        NoiseModel {
+            zero_flow: Some(self.at(x)),
+            ..*noise
+        }
+    }
+
+    /// The same noise with the zero flow of the medians.
+    pub(crate) fn median(&self, noise: &NoiseModel) -> NoiseModel {
+        self.noise_at(noise, [0.0; 2])
+    }
+
+    /// Cost of the zero flow of a noise in twice the log-likelihood, if it was estimated from the same residuals: its distance from the
+    /// medians, and by how much narrower than the prior its size and time are known (Laplace's approximation of the evidence).
+    pub(crate) fn price(
+        &self,
+        noise: &NoiseModel,
+        unlikelihood: impl Fn(&NoiseModel) -> f64,
+    ) -> f64 {
+        const STEP: f64 = 0.3;
+        let Some(z) = &noise.zero_flow else {
+            return 0.0;
+        };
+        let x = self.of(z);
+        let value = |way: [f64; 2], step: f64| {
+            unlikelihood(&self.noise_at(noise, [x[0] + step * way[0], x[1] + step * way[1]]))
+        };
+        let here = value([0.0; 2], 0.0);
+        // Half the second derivative is the information, that of the prior is 1.
+        let [size, time, both] = WAYS.map(|way| {
+            let bend = value(way, STEP) + value(way, -STEP) - 2.0 * here;
+            0.5 * bend / (STEP * STEP)
+        });
+        let (size, time, cross) = (size.max(0.0), time.max(0.0), 0.5 * (both - size - time));
+        let determinant = (1.0 + size) * (1.0 + time) - cross * cross;
+        x.iter().map(|x| x * x).sum::<f64>() + determinant.max(1.0).ln()
     }
 
     /// The same noise with the most probable zero flow; `unlikelihood` is twice the negative log-likelihood of the residuals.
@@ -66,34 +94,22 @@ impl Prior {
         noise: &NoiseModel,
         unlikelihood: impl Fn(&NoiseModel) -> f64,
     ) -> NoiseModel {
-        let with = |x: [f64; 2], drifts: bool| NoiseModel {
-            zero_flow: Some(self.at(x, drifts)),
-            ..*noise
-        };
         let begun = noise.zero_flow.map_or([0.0, 0.0], |z| self.of(&z));
-        let (x, drifts, _) = [false, true]
-            .map(|drifts| {
-                let value = |x: [f64; 2]| {
-                    let noise = with(x, drifts);
-                    unlikelihood(&noise) + self.price(noise.zero_flow.as_ref())
-                };
-                let (x, least) = descend(begun, value);
-                (x, drifts, least)
-            })
-            .into_iter()
-            .min_by(|a, b| a.2.total_cmp(&b.2))
-            .unwrap_or((begun, false, 0.0));
-        with(x, drifts)
+        let x = descend(begun, 0.05, |x| {
+            unlikelihood(&self.noise_at(noise, x)) + x.iter().map(|x| x * x).sum::<f64>()
+        });
+        self.noise_at(noise, x)
     }
 }
 
-/// Descends by steps that become smaller.
-fn descend(begun: [f64; 2], value: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
-    // Along the strength, along the time, and along both together, of which short records tell the ratio alone.
-    const WAYS: [[f64; 2]; 3] = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
+/// Along the size, along the time, and along both together, of which short records tell the ratio alone.
+const WAYS: [[f64; 2]; 3] = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
+
+/// Descends by steps that become smaller, down to `finest`.
+pub(crate) fn descend(begun: [f64; 2], finest: f64, value: impl Fn([f64; 2]) -> f64) -> [f64; 2] {
     let (mut x, mut least) = (begun, value(begun));
     let mut step = 1.6;
-    while step > 0.05 {
+    while step > finest {
         let best = WAYS
             .iter()
             .flat_map(|w| [-step, step].map(|s| [x[0] + s * w[0], x[1] + s * w[1]]))
@@ -104,13 +120,14 @@ fn descend(begun: [f64; 2], value: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) 
             _ => step *= 0.5,
         }
     }
-    (x, least)
+    x
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::data::free::Free;
+    use crate::data::motion::FlowPaths;
     use crate::data::noise::Whitener;
     use crate::dot::dot;
 
@@ -146,7 +163,8 @@ mod tests {
         let prior = Prior::new(400.0, 1e-3);
         let unlikelihood = |noise: &NoiseModel| {
             let whitener = Whitener::new(noise, &present, None);
-            let free = Free::new(noise, &whitener, &[], series.len());
+            let flow = FlowPaths::new((0..series.len()).map(|k| k as f64).collect());
+            let free = Free::new(noise, &whitener, &[], &flow);
             let mut e = vec![0.0; series.len()];
             whitener.apply(series, &mut e);
             free.take_off(&mut e);
@@ -154,7 +172,7 @@ mod tests {
         };
         let moving = prior.estimate(&still, unlikelihood);
         let gain =
-            unlikelihood(&still) - unlikelihood(&moving) - prior.price(moving.zero_flow.as_ref());
+            unlikelihood(&still) - unlikelihood(&moving) - prior.price(&moving, unlikelihood);
         (moving, gain)
     }
 
@@ -175,8 +193,7 @@ mod tests {
     fn a_zero_flow_that_stands_still_gains_nothing() {
         for seed in 1..7 {
             let (noise, gain) = estimated(&series(20_000, 0.0, 1.0, 0.0, seed));
-            // Two numbers at the edge of their range: 1 % of chi-square with two.
-            assert!(gain + 2.0 * NUMBER < 9.2, "{gain} {noise:?}");
+            assert!(gain < 0.0, "{gain} {noise:?}");
         }
     }
 
@@ -185,6 +202,6 @@ mod tests {
         // 0.4 nm a row more in every second: 1 nm/s of displacement at 400 1/s.
         let (noise, gain) = estimated(&series(38_000, 0.0, 1.0, 0.4e-6, 3));
         let z = noise.zero_flow.expect("a zero flow");
-        assert!(gain > 100.0 && z.drifts(), "{gain} {z:?}");
+        assert!(gain > 100.0, "{gain} {z:?}");
     }
 }

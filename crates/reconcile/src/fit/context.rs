@@ -173,14 +173,15 @@ impl Context<'_> {
         effects
     }
 
-    /// Whether the working point is a number of the fit. Behind a linear chain an error of it is a ramp of the position, which is free
-    /// in every record. What bends the motion behind the piezo (a bead that sticks, a wall that stiffens) needs the point itself.
+    /// Whether the place at which the rig rested before its records is a number of the fit. An unknown zero flow is free in every record;
+    /// a chain with memory, or one that bends, also needs the displacement about which it came to rest.
     pub(crate) fn has_free_offset(&self, parts: &[Part]) -> bool {
-        let bends = |effect: &Effect| match effect.act() {
-            Action::Block(block) => effect.kind().spec().place >= Place::Chip && block.bends(),
+        let remembers = |effect: &Effect| match effect.act() {
+            Action::Linear(z) => !z.poles.is_empty() || !z.zeros.is_empty(),
+            Action::Block(_) | Action::Around(_) | Action::Bypass(_) => true,
             _ => false,
         };
-        self.problem.base.free_working_point && self.effects(parts).iter().any(bends)
+        self.problem.base.free_working_point && self.effects(parts).iter().any(remembers)
     }
 
     /// Simulates a record about a working point that is `offset_um` from the model's.

@@ -248,7 +248,9 @@ impl Context<'_> {
             }
         }
         if self.has_free_offset(&fit.parts) {
-            t.offset_um += step[next];
+            // The rig rested somewhere within its commands.
+            let most_um = self.scope.stroke_um;
+            t.offset_um = (t.offset_um + step[next]).clamp(-most_um, most_um);
             next += 1;
         }
         t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);

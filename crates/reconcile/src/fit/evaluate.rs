@@ -15,7 +15,7 @@ pub(crate) struct State {
     pub sim: Vec<Vec<f64>>,
     /// The same with the lines that shake it: what the pixels see.
     pub path: Vec<Vec<f64>>,
-    /// Raw residual.
+    /// Raw residual, without the share of the edge.
     pub residual: Vec<Vec<f64>>,
     pub innovations: Vec<Vec<f64>>,
     /// Whitened edges.
@@ -26,16 +26,17 @@ pub(crate) struct State {
 impl Context<'_> {
     pub(crate) fn state(&self, fit: &Fit, mask: &Mask) -> State {
         let effects = self.effects(&fit.parts);
-        let mut edge = Vec::new();
-        let (mut sim, mut soft) = (Vec::new(), Vec::new());
+        let (mut sim, mut soft, mut edges) = (Vec::new(), Vec::new(), Vec::new());
         for (r, ranges) in self.problem.records.iter().zip(mask) {
             let mut y = Vec::new();
             // A record that does not count costs nothing.
             if ranges.is_empty() {
                 sim.push(Vec::new());
                 soft.push(Vec::new());
+                edges.push(Vec::new());
                 continue;
             }
+            let mut edge = Vec::new();
             self.simulate(r, &effects, fit.offset_um, &mut y, Some(&mut edge));
             if fit.gain != 1.0 {
                 y.iter_mut().for_each(|y| *y *= fit.gain);
@@ -46,6 +47,7 @@ impl Context<'_> {
                 r.whiten(&edge, &mut w);
             }
             soft.push(w);
+            edges.push(edge);
         }
         let mut residual = Vec::with_capacity(sim.len());
         let mut innovations = Vec::with_capacity(sim.len());
@@ -57,6 +59,10 @@ impl Context<'_> {
                 continue;
             }
             let mut e: Vec<f64> = r.y.iter().zip(&*s).map(|(y, s)| y - s).collect();
+            // The noise is told from what is left: the share of the edge is not.
+            for (e, edge) in e.iter_mut().zip(&edges[i]) {
+                *e -= fit.soft * edge;
+            }
             for (p, amplitudes) in fit.of_role(Role::Line).zip(&fit.lines) {
                 let [a, b] = amplitudes[i];
                 if a != 0.0 || b != 0.0 {
@@ -85,9 +91,6 @@ impl Context<'_> {
             }
             let mut w = vec![0.0; e.len()];
             r.whiten(&e, &mut w);
-            for (w, s) in w.iter_mut().zip(&soft[i]) {
-                *w -= fit.soft * s;
-            }
             residual.push(e);
             innovations.push(w);
         }

@@ -2,8 +2,9 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
+use crate::problem::Mask;
 use crate::thresholds::{NUMBER, THRESHOLDS};
-use cellpos_plant::effects::{Candidate, Role};
+use cellpos_plant::effects::{Action, Candidate, Role};
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
 fn chi2_quantile(k: f64, z: f64) -> f64 {
@@ -36,6 +37,20 @@ pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
 /// Sum of squares beyond the noise.
 pub(crate) fn left_over(fit: &Fit) -> f64 {
     (fit.chi2 - fit.count as f64).max(0.0)
+}
+
+/// Sum of squares that the effects of a set with a choice of equation began from: that beside its delay and its gain, which have one
+/// equation and leave no error of form to be taken for another name.
+pub(crate) fn before_forms(ctx: &Context<'_>, null: &Fit, fit: &Fit, mask: &Mask) -> f64 {
+    let of_one_form =
+        |p: &&Part| p.variant.is_gain() || matches!(p.effect(&ctx.scope).act(), Action::Delay(_));
+    let exact: Vec<Part> = fit.parts.iter().filter(of_one_form).cloned().collect();
+    let alone = match exact.len() {
+        0 => return null.chi2,
+        n if n == fit.parts.len() => fit.chi2,
+        _ => ctx.fit_from(exact, Some(fit.soft), mask, 8).chi2,
+    };
+    alone.min(null.chi2)
 }
 
 /// Scatter of a sum of squares over `n` rows: chance, and the error of the noise estimate.

@@ -4,7 +4,9 @@ use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::problem::Mask;
-use crate::search::cost::{leaves_much, left_over, penalised_cost, threshold, threshold_of};
+use crate::search::cost::{
+    before_forms, leaves_much, left_over, penalised_cost, threshold, threshold_of,
+};
 use crate::search::effort::Effort;
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
@@ -137,7 +139,7 @@ fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&
     cellpos_parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
 }
 
-/// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is the sum of squares without effects.
+/// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is what the forms of `smaller` began from.
 fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
     let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
     let off_response = bigger
@@ -154,7 +156,8 @@ fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
 }
 
 /// Takes back effects that are no longer needed.
-fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: f64, mask: &Mask, effort: Effort) -> Fit {
+fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: &Fit, mask: &Mask, effort: Effort) -> Fit {
+    let null = before_forms(ctx, null, &fit, mask);
     while fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..fit.parts.len()).collect();
         let without = cellpos_parallel::map(&indices, effort.threads, |&i| {
@@ -349,7 +352,7 @@ pub(crate) fn search(
     let begun = match start.filter(|f| !f.parts.is_empty()) {
         Some(start) => {
             let again = ctx.fit_from(start.parts.clone(), Some(start.soft), mask, 12);
-            Some((eliminate(ctx, again, null.chi2, mask, effort), Vec::new()))
+            Some((eliminate(ctx, again, &null, mask, effort), Vec::new()))
         }
         None => {
             progress("screening single effects");
@@ -384,10 +387,11 @@ pub(crate) fn search(
             break;
         }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
-        let least = THRESHOLDS.addition_share * (null.chi2 - fit.chi2);
+        let forms = before_forms(ctx, &null, &fit, mask);
+        let least = THRESHOLDS.addition_share * (forms - fit.chi2);
         let mut next: Vec<Fit> =
             extensions(ctx, &fit, mask, effort, 6, &[], [least, f64::INFINITY]);
-        next.retain(|f| worth_it(&fit, f, null.chi2));
+        next.retain(|f| worth_it(&fit, f, forms));
         if next.is_empty() {
             break;
         }
@@ -402,7 +406,7 @@ pub(crate) fn search(
         let Some(top) = next.first().cloned() else {
             break;
         };
-        let top = eliminate(ctx, top, null.chi2, mask, effort);
+        let top = eliminate(ctx, top, &null, mask, effort);
         if penalised_cost(ctx, &top) >= penalised_cost(ctx, &fit) {
             break;
         }
@@ -429,7 +433,7 @@ pub(crate) fn search(
         let rich = much_left(&top);
         fit = reparametrise(ctx, top, mask, effort, rich);
         if !alike(&fit.parts, &forms) {
-            fit = eliminate(ctx, fit, null.chi2, mask, effort);
+            fit = eliminate(ctx, fit, &null, mask, effort);
         }
         steps.push((ids(&fit), fit.chi2));
         beam = Vec::new();

@@ -161,9 +161,8 @@ fn zero_flow(ctx: &Context<'_>) -> Option<String> {
     let time_s = z.time_rows * dt;
     let in_a_second_um = speed_um_per_s * (2.0 / time_s).min(1.0).sqrt() / speed_per_um;
     Some(format!(
-        "the zero flow moves by {} of displacement in a second{}: noise, and no effect",
-        ctx.scales.told(in_a_second_um),
-        if z.drifts() { ", and drifts" } else { "" }
+        "the zero flow moves by {} of displacement in a second: noise, and no effect",
+        ctx.scales.told(in_a_second_um)
     ))
 }
 

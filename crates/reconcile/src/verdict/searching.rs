@@ -1,7 +1,7 @@
 //! The search under the noise that goes with what it finds: a floor that a better fit lowers, a zero flow that moves.
 
 use crate::data::coloured::NoiseKind;
-use crate::data::floor::{Floor, from_residuals};
+use crate::data::floor::{Floor, refined};
 use crate::data::noise::NoiseModel;
 use crate::data::zero_flow::Prior;
 use crate::fit::catalogue::{self, Part};
@@ -67,23 +67,22 @@ impl Searching<'_> {
         loop {
             let ctx = self.context(&problem, floor.rows);
             let found = search(&ctx, &problem.all(), effort, start.as_ref(), &mut *progress);
-            // The residual of a good fit is at least as good an estimate of the noise.
-            let (residual, _) = ctx.residual(&found.fit);
             let noise = problem.noise;
-            let refined = NoiseModel {
-                zero_flow: noise.zero_flow,
-                ..from_residuals(&problem.present(), &residual)
-            };
             round += 1;
             // A floor that was measured is not talked down by a fit that has numbers to spare.
-            if round >= 2
+            let last = round >= 2
                 || found.cut_short
                 || !floor.source.is_known()
-                // Increments tell a walk from white noise, no more.
+                // The likelihood tells a walk from white noise, no more.
                 || self.kind == NoiseKind::White
-                || noise.coloured.is_some()
-                || refined.innovation_um() > 0.97 * noise.innovation_um()
-            {
+                || noise.coloured.is_some();
+            if last {
+                return Searched { found, problem };
+            }
+            // The residual of a good fit is at least as good an estimate of the noise.
+            let (residual, _) = ctx.residual(&found.fit);
+            let refined = refined(&noise, |noise| problem.unlikelihood(noise, &residual));
+            if refined.innovation_um() > 0.97 * noise.innovation_um() {
                 return Searched { found, problem };
             }
             problem = problem.with_noise(refined);
@@ -91,13 +90,13 @@ impl Searching<'_> {
         }
     }
 
-    /// The set with a moving zero flow, if that is more probable than the set without one.
+    /// Searches under the noise of the rig: a zero flow that moves, or, if that is more probable, one that stands still.
     ///
-    /// In a closed loop a zero flow and a slow effect of the response explain much the same motion. So the joint cost of both decides:
-    /// parts are removed from the set one by one, each time with a new estimate of the zero flow, and the search goes on from the best.
-    pub(super) fn beside_zero_flow(
+    /// In a closed loop a zero flow and a slow effect of the response explain much the same motion, and the zero flow is always there.
+    /// So the search begins beside it. Each set gives another estimate of it, until that settles.
+    pub(super) fn under_noise(
         &self,
-        still: Searched,
+        problem: Problem,
         floor: &Floor,
         effort: Effort,
         progress: &mut dyn FnMut(&str),
@@ -105,80 +104,53 @@ impl Searching<'_> {
         /// Another estimate of the zero flow changes nothing that decides.
         const SETTLED: f64 = 1.0;
         const MOST_ROUNDS: usize = 3;
-        let base = &still.problem.base;
-        let rests = base.free_start
-            || self.free_gain
-            || !held_out::integrates(&self.context(&still.problem, 0));
-        let sensor = still.problem.noise.coloured.is_some();
-        if rests || sensor || !floor.source.is_known() {
-            return still;
+        let base = &problem.base;
+        let rests =
+            base.free_start || self.free_gain || !held_out::integrates(&self.context(&problem, 0));
+        if rests || problem.noise.coloured.is_some() || !floor.source.is_known() {
+            return self.search(problem, floor, effort, None, progress);
         }
-        let least = self.cost(&still.problem, &still.found.fit);
-        let Some(mut best) = self.taken_back(&still, least, effort) else {
-            return still;
-        };
-        progress("the zero flow moves: looking further beside it");
-        let mut searched = None;
+        let median = prior_of(&problem).median(&problem.noise);
+        let beside = problem.clone().with_noise(median);
+        let mut moving = self.search(beside, floor, effort, None, &mut *progress);
         for _ in 0..MOST_ROUNDS {
-            let problem = still.problem.clone().with_noise(best.noise);
-            let start = Some(best.fit.clone());
-            let next = self.search(problem, floor, effort, start, &mut *progress);
-            let weighed = self.with_zero_flow(&next.problem, &next.found.fit);
-            let cost = self.cost(&next.problem, &next.found.fit);
-            searched = Some(next);
-            if weighed.cost > cost - SETTLED {
+            if moving.found.cut_short {
+                return moving;
+            }
+            let weighed = self.with_zero_flow(&moving.problem, &moving.found.fit);
+            if weighed.cost > self.cost(&moving.problem, &moving.found.fit) - SETTLED {
                 break;
             }
-            best = weighed;
+            let problem = moving.problem.with_noise(weighed.noise);
+            moving = self.search(problem, floor, effort, Some(weighed.fit), &mut *progress);
         }
-        match searched {
-            Some(s) if self.cost(&s.problem, &s.found.fit) < least => s,
-            _ => still,
-        }
-    }
-
-    /// The best set with a moving zero flow, or `None` if the set without one is better. Starts: the set, its first effect, and no effect,
-    /// and the set without one part.
-    fn taken_back(&self, still: &Searched, least: f64, effort: Effort) -> Option<Weighed> {
-        let problem = &still.problem;
-        let fit = &still.found.fit;
-        let all = problem.all();
-        let beside = |fits: &[Fit]| {
-            cellpos_parallel::map(fits, effort.threads, |fit| {
-                self.with_zero_flow(problem, fit)
-            })
-            .into_iter()
-            .min_by(|a, b| a.cost.total_cmp(&b.cost))
+        progress("looking further without a zero flow that moves");
+        let noise = NoiseModel {
+            zero_flow: None,
+            ..moving.problem.noise
         };
-        let less = |fit: &Fit| -> Vec<Fit> {
-            let indices: Vec<usize> = (0..fit.parts.len()).collect();
-            cellpos_parallel::map(&indices, effort.threads, |&i| {
-                let mut parts = fit.parts.clone();
-                parts.remove(i);
-                self.context(problem, 0)
-                    .fit_from(parts, Some(fit.soft), &all, 8)
-            })
-        };
-        let mut begin = vec![fit.clone(), still.found.null.clone()];
-        if let Some(first) = fit.parts.first().filter(|_| fit.parts.len() > 2) {
-            let ctx = self.context(problem, 0);
-            begin.push(ctx.fit_from(vec![first.clone()], Some(fit.soft), &all, 8));
+        let problem = problem.with_noise(noise);
+        let start = Some(moving.found.fit.clone());
+        let still = self.search(problem, floor, effort, start, &mut *progress);
+        // What is there beside a zero flow that moves is there without: else a leak may stand for both.
+        let keeps = moving
+            .found
+            .fit
+            .parts
+            .iter()
+            .all(|p| still.found.fit.has(p.id()));
+        let cost = |s: &Searched| self.cost(&s.problem, &s.found.fit);
+        match keeps && cost(&still) < cost(&moving) {
+            true => still,
+            false => moving,
         }
-        begin.extend(less(fit));
-        let mut best = beside(&begin)?;
-        while let Some(next) = beside(&less(&best.fit)).filter(|n| n.cost < best.cost) {
-            best = next;
-        }
-        (best.cost < least).then_some(best)
     }
 
     /// A set fitted again with the most probable zero flow of its residuals.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
         let (residual, _) = self.context(problem, 0).residual(fit);
         let noise = prior_of(problem).estimate(&problem.noise, |noise| {
-            (problem.records.iter().zip(&residual))
-                .map(|(r, residual)| r.unlikelihood(noise, residual))
-                .sum()
+            problem.unlikelihood(noise, &residual)
         });
         let problem = problem.clone().with_noise(noise);
         let fit = self.context(&problem, 0).refit(fit, &problem.all(), 8);
@@ -189,17 +161,20 @@ impl Searching<'_> {
         }
     }
 
-    /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the noise's numbers and, for each part,
+    /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the zero flow and, for each part,
     /// what any addition must gain.
     fn cost(&self, problem: &Problem, fit: &Fit) -> f64 {
         let records = problem.records.len();
+        let (residual, _) = self.context(problem, 0).residual(fit);
         let dearer = |p: &Part| {
             threshold_of(p.variant(), records) - NUMBER * freedom_of(p.variant(), records) as f64
         };
         penalised_cost(&self.context(problem, 0), fit)
             + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
             + problem.log_determinant()
-            + prior_of(problem).price(problem.noise.zero_flow.as_ref())
+            + prior_of(problem).price(&problem.noise, |noise| {
+                problem.unlikelihood(noise, &residual)
+            })
     }
 }
 

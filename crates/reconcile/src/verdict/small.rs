@@ -7,7 +7,7 @@
 //! another, since something was set aside, nothing small is looked for.
 
 use crate::fit::context::{Context, Fit};
-use crate::search::cost::{penalised_cost, prior_penalty, threshold};
+use crate::search::cost::{before_forms, penalised_cost, prior_penalty, threshold};
 use crate::search::effort::Effort;
 use crate::search::sequential::{FREELY, Found, extensions, ids, settle};
 use crate::thresholds::THRESHOLDS;
@@ -61,7 +61,8 @@ fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: 
     let another_anchoring =
         part.variant.is_gain() && top.parts.iter().any(|p| p.variant.has_two_gains());
     // What gains more was weighed by the search.
-    let most = THRESHOLDS.addition_share * (found.null.chi2 - found.fit.chi2);
+    let began = before_forms(ctx, &found.null, &found.fit, &ctx.problem.all());
+    let most = THRESHOLDS.addition_share * (began - found.fit.chi2);
     gained < most
         && gained > THRESHOLDS.small_gain * threshold(added)
         && part.matters()

@@ -3,6 +3,7 @@
 use crate::data::coloured::NoiseKind;
 use crate::data::floor::{self, FloorSource};
 use crate::data::frames;
+use crate::data::motion::ZeroFlow;
 use crate::data::noise::NoiseModel;
 use crate::data::record::{Record, canonical};
 use crate::error::ReconcileError;
@@ -146,7 +147,7 @@ fn within(
     };
     let floor = floor::estimate(&records, &present, &residual, stated, kind);
     let problem = problem.with_noise(floor.noise);
-    let unlike = guard::motion(&searching.context(&problem, 0))?;
+    let unlike = guard::motion(&searching.context(&beside_any_flow(&searching, &problem), 0))?;
 
     let effort = Effort {
         threads: options.threads,
@@ -158,9 +159,8 @@ fn within(
         },
         work: (options.work * WORK) as u64,
     };
-    let still = searching.search(problem, &floor, effort, None, &mut *progress);
     let Searched { mut found, problem } =
-        searching.beside_zero_flow(still, &floor, effort, &mut *progress);
+        searching.under_noise(problem, &floor, effort, &mut *progress);
     let ctx = searching.context(&problem, floor.rows);
     progress(&format!(
         "held-out check (the search took {:.2} of its work)",
@@ -230,6 +230,24 @@ fn confirmed(
         held = held_out::check(ctx, &found.fit, threads);
     }
     held
+}
+
+/// The problem with a zero flow as large as the commands, of a plant that integrates: slow motion then says nothing of the response.
+fn beside_any_flow(searching: &Searching<'_>, problem: &Problem) -> Problem {
+    let base = &problem.base;
+    if base.free_start || !held_out::integrates(&searching.context(problem, 0)) {
+        return problem.clone();
+    }
+    let motion_um = searching.scope.stroke_um * base.speed_per_um() * base.sample_s;
+    problem.clone().with_noise(NoiseModel {
+        zero_flow: Some(ZeroFlow {
+            motion_um2: motion_um * motion_um,
+            time_rows: searching.scope.length_s / base.sample_s,
+            drift_um: 0.0,
+        }),
+        coloured: None,
+        ..problem.noise
+    })
 }
 
 /// The noise that a model states, unless it says that its figures are a fit's own residual.

@@ -1,5 +1,7 @@
 //! Verdicts on records.
 
+mod closed_loop;
+mod closed_loop_table;
 mod labelled;
 mod measured;
 mod measured_piezo;

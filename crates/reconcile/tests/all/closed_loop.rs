@@ -1,0 +1,302 @@
+//! A rig in a closed loop whose zero flow moves, simulated apart from the catalogue: Eq. (6) by Euler steps of 50 us.
+
+use cellpos_numeric::Random;
+use cellpos_plant::{Model, Noise};
+use cellpos_reconcile::{Options, Reconciliation, Record, reconcile};
+use std::f64::consts::TAU;
+
+const STEPS_A_ROW: usize = 20;
+const ROW_S: f64 = 1e-3;
+const ROWS: usize = 38_000;
+pub(super) const DELAY_S: f64 = 2.3e-3;
+pub(super) const WORKING_POINT_UM: f64 = 20.0;
+
+/// How the zero flow moves: size \[um\] and time \[s\] of its wandering, and its drift \[um/s\].
+#[derive(Clone, Copy)]
+pub(super) struct Flow {
+    pub(super) wander_um: f64,
+    pub(super) time_s: f64,
+    pub(super) drift_um_per_s: f64,
+}
+
+/// What lies between command and bead beside the delay.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Hidden {
+    Nothing,
+    Gain(f64),
+    /// Corner \[rad/s\].
+    Leak(f64),
+    /// Ends of the range \[um\].
+    Clip(f64, f64),
+    /// Share of the stroke, by Dahl's equation, and the motion after which it has turned \[um\].
+    Dahl(f64, f64),
+    /// Corner \[Hz\].
+    Lag(f64),
+    /// Frequency \[Hz\] and damping.
+    Resonance(f64, f64),
+    /// Strength, and time \[s\].
+    Relaxation(f64, f64),
+    /// Part of a step that comes late, by eight exponentials of 10 ms to 30 s, per decade.
+    Creep(f64),
+    /// Speed below which the bead sticks \[um/s\].
+    Adhesion(f64),
+    /// Most speed of the amplifier \[um/s\].
+    Slew(f64),
+    /// Share of the frames that are lost.
+    Drops(f64),
+    /// Share of the frames that come twice, in the place of the next.
+    Repeats(f64),
+    /// Displacement about rest that moves nothing \[um\].
+    DeadZone(f64),
+    /// Play \[um\].
+    Play(f64),
+    /// Cubic part \[1/um^2\].
+    Stiffening(f64),
+    /// Frequency \[Hz\], damping and share of a stand that the piezo shakes.
+    Shake(f64, f64, f64),
+    /// Change of the gain \[1/s\].
+    GainDrift(f64),
+    /// Frequency \[Hz\] and size \[um\] of a line in the picture.
+    Line(f64, f64),
+}
+
+impl Hidden {
+    /// The id that is right, and the numbers that mean the same as the catalogue's.
+    pub(super) fn truth(self) -> (&'static str, Vec<(&'static str, f64)>) {
+        match self {
+            Self::Nothing => ("", vec![]),
+            Self::Gain(f) => ("gain-error", vec![("factor", f)]),
+            Self::Leak(w) => ("leak", vec![("corner_rad_per_s", w)]),
+            Self::Clip(low, high) => ("saturation", vec![("low_um", low), ("high_um", high)]),
+            Self::Dahl(share, _) => ("pzt-hysteresis", vec![("fraction", share)]),
+            Self::Lag(hz) => ("driver-lag", vec![("bandwidth_hz", hz)]),
+            Self::Resonance(hz, d) => ("pzt-resonance", vec![("frequency_hz", hz), ("damping", d)]),
+            Self::Relaxation(..) => ("pdms-relaxation", vec![]),
+            Self::Creep(_) => ("pzt-creep", vec![]),
+            Self::Adhesion(v) => ("wall-adhesion", vec![("speed_um_per_s", v)]),
+            Self::DeadZone(_) => ("wall-adhesion", vec![]),
+            Self::Slew(rate) => ("slew-limit", vec![("rate_um_per_s", rate)]),
+            Self::Drops(rate) => ("frame-drops", vec![("rate", rate)]),
+            Self::Repeats(rate) => ("frame-repeats", vec![("rate", rate)]),
+            Self::Play(width) => ("backlash", vec![("width_um", width)]),
+            Self::Stiffening(c) => ("stiffening", vec![("per_um2", c)]),
+            Self::Shake(hz, d, share) => (
+                "camera-shake",
+                vec![("frequency_hz", hz), ("damping", d), ("share", share)],
+            ),
+            Self::GainDrift(r) => ("gain-drift", vec![("per_s", r)]),
+            Self::Line(hz, um) => (
+                if hz < 40.0 {
+                    "pump-pulsation"
+                } else {
+                    "mains-hum"
+                },
+                vec![("hz", hz), ("um", um)],
+            ),
+        }
+    }
+}
+
+/// The states of what is hidden, advanced by Euler steps.
+struct Chain {
+    hidden: Hidden,
+    state: [f64; 8],
+    before: f64,
+}
+
+impl Chain {
+    fn new(hidden: Hidden) -> Self {
+        Self {
+            hidden,
+            state: [0.0; 8],
+            before: 0.0,
+        }
+    }
+
+    /// What reaches the plant of a displacement, counted from the working point.
+    fn advance(&mut self, u: f64, h: f64) -> f64 {
+        let s = &mut self.state;
+        let moved = u - self.before;
+        self.before = u;
+        match self.hidden {
+            Hidden::Nothing
+            | Hidden::Adhesion(_)
+            | Hidden::Drops(_)
+            | Hidden::Repeats(_)
+            | Hidden::Line(..) => u,
+            Hidden::Gain(factor) => factor * u,
+            Hidden::GainDrift(per_s) => {
+                s[0] += h;
+                (1.0 + per_s * s[0]) * u
+            }
+            Hidden::DeadZone(width) => u - u.clamp(-0.5 * width, 0.5 * width),
+            Hidden::Play(width) => {
+                s[0] = s[0].clamp(u - 0.5 * width, u + 0.5 * width);
+                s[0]
+            }
+            Hidden::Stiffening(c) => u + c * u.powi(3),
+            // s[0], s[1]: the stand; what it adds to the picture is read from outside.
+            Hidden::Shake(hz, damping, share) => {
+                let w = TAU * hz;
+                s[1] += h * (w * w * (u - s[0]) - 2.0 * damping * w * s[1]);
+                s[0] += h * s[1];
+                s[2] = share * (u - s[0] - 2.0 * damping * s[1] / w);
+                u
+            }
+            Hidden::Leak(corner) => u - lagged(&mut s[0], u, h * corner),
+            Hidden::Clip(low, high) => u.clamp(low - WORKING_POINT_UM, high - WORKING_POINT_UM),
+            Hidden::Dahl(share, turn_um) => {
+                s[0] += moved / turn_um * (1.0 - moved.signum() * s[0]);
+                u - share * turn_um * s[0]
+            }
+            Hidden::Lag(hz) => lagged(&mut s[0], u, h * TAU * hz),
+            Hidden::Resonance(hz, damping) => {
+                // Leapfrog, the speed half a step ahead: its mean over the step damps.
+                let w = TAU * hz;
+                let (before, drag) = (s[0], h * damping * w);
+                s[1] = ((1.0 - drag) * s[1] + h * w * w * (u - s[0])) / (1.0 + drag);
+                s[0] += h * s[1];
+                0.5 * (before + s[0])
+            }
+            Hidden::Relaxation(strength, time_s) => u - strength * lagged(&mut s[0], u, h / time_s),
+            Hidden::Creep(per_decade) => {
+                // Half a decade apart.
+                let mut x = u;
+                for (i, s) in s.iter_mut().enumerate() {
+                    let time_s = 0.01 * 10f64.powf(0.5 * i as f64);
+                    x += 0.5 * per_decade * lagged(s, u, h / time_s);
+                }
+                x
+            }
+            Hidden::Slew(rate) => {
+                s[0] += (u - s[0]).clamp(-rate * h, rate * h);
+                s[0]
+            }
+        }
+    }
+}
+
+/// Mean output over a step of a lag whose rate times the step is `share`; `state` goes on to the end of the step.
+fn lagged(state: &mut f64, u: f64, share: f64) -> f64 {
+    let (before, kept) = (*state, (-share).exp());
+    *state = u + (before - u) * kept;
+    u + (before - u) * (1.0 - kept) / share
+}
+
+/// What the loop adds to the command.
+pub(super) type Added = fn(f64) -> f64;
+
+/// Seven lines of one size.
+pub(super) fn tones(now_s: f64) -> f64 {
+    [0.7, 1.9, 4.1, 9.7, 17.3, 31.1, 53.9]
+        .iter()
+        .enumerate()
+        .map(|(i, hz)| 0.05 * (TAU * hz * now_s + 1.7 * (i * i) as f64).sin())
+        .sum()
+}
+
+/// What a survey adds: many lines, three of them at three sizes, and a rest.
+pub(super) fn survey(now_s: f64) -> f64 {
+    let tones = |all: &[f64], size: f64| -> f64 {
+        let one = |(i, hz): (usize, &f64)| (TAU * hz * now_s + 1.7 * (i * i) as f64).sin();
+        size * all.iter().enumerate().map(one).sum::<f64>()
+    };
+    let three = [3.0, 11.0, 47.0];
+    match now_s {
+        ..15.0 => tones(
+            &[
+                1.5, 2.5, 4.5, 7.5, 13.5, 23.5, 41.5, 71.5, 127.5, 223.5, 331.5,
+            ],
+            0.08,
+        ),
+        ..21.0 => tones(&three, 0.3),
+        ..26.0 => tones(&three, 0.12),
+        ..30.0 => tones(&three, 0.045),
+        _ => 0.0,
+    }
+}
+
+/// Eq. (6) by Euler steps of 50 us behind a delay and what is hidden, under a PI law that holds the bead while something is
+/// added to the command.
+pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -> Record {
+    let model = Model::eq6();
+    let (num, den) = (model.plant.num(), model.plant.den());
+    let (direct, slow) = (num[0] / den[0], [den[1] / den[0], den[2] / den[0]]);
+    // What is left of the numerator beside the direct path, in the controllable form.
+    let rest = [
+        num[1] / den[0] - direct * slow[0],
+        num[2] / den[0] - direct * slow[1],
+    ];
+    let mut random = Random::new(seed);
+    let step_s = ROW_S / STEPS_A_ROW as f64;
+    let late = (DELAY_S / step_s).round() as usize;
+    let mut commands = vec![0.0; ROWS * STEPS_A_ROW + late];
+    let keep = (-ROW_S / flow.time_s).exp();
+    let mut wander = flow.wander_um * random.normal();
+    let (mut x, mut walk, mut sum) = ([0.0, 0.0], 0.0, 0.0);
+    let mut chain = Chain::new(hidden);
+    let (mut stuck, mut last) = (0.0, 0.0);
+    let (mut t, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
+    for k in 0..ROWS {
+        let now_s = k as f64 * ROW_S;
+        let zero = wander + flow.drift_um_per_s * now_s;
+        let mut position = 0.0;
+        for i in 0..STEPS_A_ROW {
+            let input = chain.advance(commands[k * STEPS_A_ROW + i], step_s) - zero;
+            let free = rest[0] * x[1] + rest[1] * x[0] + direct * input;
+            if let Hidden::Adhesion(least) = hidden {
+                let speed = (free - last) / step_s;
+                let slips = speed.signum() * (speed.abs() - least).max(0.0);
+                stuck += step_s * slips;
+                last = free;
+            } else {
+                stuck = free;
+            }
+            if i == 0 {
+                position = stuck;
+            }
+            let bends = input - slow[0] * x[1] - slow[1] * x[0];
+            x = [x[0] + step_s * x[1], x[1] + step_s * bends];
+        }
+        let shown = match hidden {
+            Hidden::Shake(..) => chain.state[2],
+            Hidden::Line(hz, um) => um * (TAU * hz * now_s + 0.6).sin(),
+            _ => 0.0,
+        };
+        let mut seen = position + walk + shown + 0.012 * random.normal();
+        if matches!(hidden, Hidden::Repeats(rate) if random.uniform() < rate) {
+            seen = y.last().copied().unwrap_or(seen);
+        }
+        sum += seen * ROW_S;
+        let command = -0.03 * seen - 0.06 * sum + added(now_s);
+        for i in 0..STEPS_A_ROW {
+            commands[k * STEPS_A_ROW + i + late] = command;
+        }
+        let lost = matches!(hidden, Hidden::Drops(rate) if random.uniform() < rate);
+        if !lost {
+            t.push(now_s);
+            u.push(WORKING_POINT_UM + command);
+            y.push(seen);
+        }
+        walk += (2.0 * 0.33 * ROW_S).sqrt() * random.normal();
+        wander = keep * wander + (1.0 - keep * keep).sqrt() * flow.wander_um * random.normal();
+    }
+    Record::from_rows("loop", &t, &u, &y).unwrap()
+}
+
+pub(super) fn run(record: Record) -> Reconciliation {
+    run_from(record, WORKING_POINT_UM, &Options::default())
+}
+
+/// With another working point of the model.
+pub(super) fn run_from(record: Record, working_point_um: f64, options: &Options) -> Reconciliation {
+    let model = Model {
+        working_point_um,
+        noise: Noise {
+            diffusion_um2_per_s: 0.33,
+            localisation_um: 0.012,
+        },
+        ..Model::eq6()
+    };
+    reconcile(&model, &[record], options, &mut |_| {}).unwrap()
+}
