@@ -436,7 +436,6 @@ pub(crate) fn search(
             fit = eliminate(ctx, fit, &null, mask, effort);
         }
         steps.push((ids(&fit), fit.chi2));
-        beam = Vec::new();
     }
     progress("refitting all together");
     // Rivals of a set that is no whole explanation, and that nothing more will be added to, decide nothing: no name.
