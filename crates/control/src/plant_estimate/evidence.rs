@@ -5,7 +5,7 @@
 //! `sum x_i y = gain * sum x_i p_j e_j(delay)`, plus a term with the variance of the products `x r`, where `r` is the residual of `y`.
 //! That variance is measured in blocks that are longer than the correlation of `x`, so it includes the colour of the disturbance.
 
-use super::belief::{self, Belief, Finding, Likelihood};
+use super::belief::{Belief, Finding, Likelihood, delay_at};
 
 /// Lags of the instrument beyond the design's delay, samples. A position between two ticks is on the line through them, so that
 /// any delay between the first and the last is in their span.
@@ -23,9 +23,6 @@ const MEMORY: f64 = 128.0;
 const ANSWER: f64 = 0.25;
 /// Blocks after which the variance of the products is known to 25 %, so that they count as evidence.
 const LEARNED: f64 = 8.0;
-/// Square of a block's distance from the estimate, over the variance, that is too far for its noise: three standard deviations above its
-/// mean (chi-squared with [`MEMBERS`] degrees of freedom).
-const FAR: f64 = 12.5;
 
 type Vector = [f64; MEMBERS];
 type Matrix = [Vector; MEMBERS];
@@ -129,7 +126,6 @@ impl Evidence {
                 self.block.xx[i][j] += x * fix.x_um[j];
             }
         }
-        self.found = self.belief.advance().or(self.found);
         self.fixes += 1;
         self.fixes >= BLOCK
     }
@@ -146,16 +142,9 @@ impl Evidence {
         let white = forward(&l, &left);
         let left_um2 = dot(&white, &white);
         self.blocks += 1.0;
-        let far = self.blocks > LEARNED && left_um2 > FAR * self.noise_um2;
-        let counted_um2 = if far { FAR * self.noise_um2 } else { left_um2 };
-        self.noise_um2 += (counted_um2 / MEMBERS as f64 - self.noise_um2) / self.blocks.min(MEMORY);
-        // A block that is too far off has the noise that it shows.
-        let noise_um2 = if far {
-            left_um2 / MEMBERS as f64
-        } else {
-            self.noise_um2
-        };
-        let weight = 1.0 / noise_um2;
+        let left_um2 = left_um2 / MEMBERS as f64;
+        self.noise_um2 += (left_um2 - self.noise_um2) / self.blocks.min(MEMORY);
+        let weight = 1.0 / self.noise_um2;
         // The commands answer the disturbance, so their products in this block correlate with its noise. How they follow the motion that was
         // chosen is known from the blocks before.
         let answered: Vector =
@@ -171,20 +160,21 @@ impl Evidence {
         let before = commanded(delay);
         let score: Vector = std::array::from_fn(|i| left[i] + gain * dot(&block.xx[i], &before));
         let likelihood = |d: usize| {
-            let by = commanded(belief::FIRST + belief::STEP * d as f64);
+            let by = commanded(delay_at(d));
             let moved: Vector = std::array::from_fn(|i| dot(&block.xx[i], &by));
-            Likelihood::new(weight * dot(&by, &score), weight * dot(&by, &moved))
+            Likelihood {
+                score: weight * dot(&by, &score),
+                information: weight * dot(&by, &moved),
+            }
         };
         let seconds = f64::from(BLOCK) * fix_s;
         if self.blocks > LEARNED {
-            (self.belief).observe(std::array::from_fn(likelihood), seconds);
+            let likelihoods = std::array::from_fn(likelihood);
+            self.found = Some(self.belief.observe(&likelihoods, seconds));
         }
         self.recent.take(&block);
     }
 }
-
-/// A block enters the belief before the next one is complete.
-const _: () = assert!(belief::DELAYS < BLOCK as usize);
 
 /// Factor of a matrix; `None` if it is zero.
 fn cholesky(v: &Matrix) -> Option<Matrix> {

@@ -47,6 +47,8 @@ const DOWN_PER_TICK: f64 = 0.001;
 const DELAY_SURE: f64 = 3.66;
 /// Logarithm of the odds of a change that is reported: one of 3000 is false if the noise is as it is measured.
 const REPORT_SURE: f64 = 8.0;
+/// The same, standard deviations of a normal distribution.
+const REPORT_SDS: f64 = 3.4;
 /// Ticks between two changes of the delay.
 const DELAY_TICKS: u16 = 20;
 /// A change of the gain that is reported, by its logarithm. The tuning, and a standard deviation of the estimate, must first be within half
@@ -205,9 +207,10 @@ impl Retuning {
         if self.moving || off.max(found.log_sd) > 0.5 * REPORTED_GAIN {
             return None;
         }
-        let farther = 0.5 * REPORTED_GAIN + INTERVAL * before.log_sd;
-        let gain = (found.log_gain - before.log_gain).abs() > REPORTED_GAIN
-            && found.gain_odds(before.log_gain, farther) > REPORT_SURE;
+        let change = (found.log_gain - before.log_gain).abs();
+        let farther =
+            0.5 * REPORTED_GAIN + INTERVAL * before.log_sd + REPORT_SDS * found.log_sd;
+        let gain = change > REPORTED_GAIN && change > farther;
         let surely_not = |member: usize, sure: f64| {
             let [longer, shorter] = found.delay_odds(DELAYS[member]);
             longer.max(shorter) > sure
