@@ -47,7 +47,6 @@ mod linear;
 mod loop_io;
 mod loop_model;
 mod lqg;
-mod monitor;
 mod mpc;
 mod partner;
 mod path;
@@ -81,7 +80,6 @@ pub use linear::LinearLaw;
 pub use loop_io::{InForce, LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 pub use loop_model::{LoopMode, LoopModel, MODES};
 pub use lqg::{Feedback, Lqg, LqgLaw, LqgState};
-pub use monitor::{PlantEstimate, PlantMonitor, PlantMonitorState, PlantVerdict};
 pub use mpc::{HORIZON, Mpc, MpcLaw, MpcState, SolverKind, TimedSolve};
 pub use partner::{
     Partner, PartnerConfig, PartnerInput, PartnerOutput, PartnerState, PartnerStatus, Probe,

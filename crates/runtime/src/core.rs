@@ -41,7 +41,7 @@ use crate::tick_record::TickFlags;
 pub use crate::timing::{CoreError, Timing};
 use cellpos_control::{
     Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, Measurement as LoopMeasurement,
-    Mode, Partner, PlantMonitor, PlantMonitorState, SolverStatus, SolverTerms,
+    Mode, Partner, SolverStatus, SolverTerms,
 };
 use cellpos_plant::TransferFunction;
 use cellpos_rig::ActuatorReport;
@@ -102,7 +102,6 @@ struct State {
     pictures_repeated: u32,
     parked_at: Option<u64>,
     unrecorded_since_ns: Option<i64>,
-    plant: PlantMonitorState,
     partner: partner::Slow,
     stage: Stage,
 }
@@ -121,7 +120,6 @@ pub struct Core<R> {
     preview_um: Vec<f64>,
     learners: Learners,
     late_solver_ns: Vec<Range<i64>>,
-    monitor: PlantMonitor,
     partner: Option<Partner>,
     references: crate::reference_history::ReferenceHistory,
     state: State,
@@ -172,7 +170,6 @@ impl<R: ReferenceGenerator> Core<R> {
             estimator.ticks_per_fix,
         )?;
         let settings = controller.settings();
-        let monitor = PlantMonitor::new(settings.estimator, settings.model)?;
         let following = following::Following::new(
             &settings.estimator,
             &settings.model,
@@ -190,11 +187,9 @@ impl<R: ReferenceGenerator> Core<R> {
             diffusion_um2_per_s: estimator.diffusion_um2_per_s,
             learners: Learners::default(),
             late_solver_ns: Vec::new(),
-            monitor,
             partner: None,
             references: Default::default(),
             state: State {
-                plant: monitor.start(displacement_um),
                 seq: 0,
                 grid: None,
                 index: 0,
@@ -474,7 +469,6 @@ impl<R: ReferenceGenerator> Core<R> {
             (fix.position_um, age)
         });
         self.learners.learn(seen, &output.driven);
-        self.watch_plant(fix, &output, tick);
         if let Some(news) = self.controller.adaptation().and_then(|now| now.news) {
             let ms = |samples: f64| samples * self.sample_s * 1e3;
             tick.event(EventKind::Adapted {

@@ -5,7 +5,6 @@
 //! when its cause goes away; safe (ramp to park: the bead is lost, the hardware is not) is not.
 
 use crate::reference::Stage;
-use cellpos_control::PlantVerdict;
 use cellpos_rig::{ActuatorFault, ActuatorState};
 use serde::{Deserialize, Serialize};
 
@@ -279,15 +278,6 @@ pub enum EventKind {
     TicksSkipped {
         /// How many.
         count: u64,
-    },
-    /// The plant is no longer what it was, or is so again.
-    PlantChanged {
-        /// What it is taken for.
-        verdict: PlantVerdict,
-        /// Its gain over the model's; NaN where it is not known.
-        gain_ratio: f64,
-        /// Lag that the model lacks, ms; NaN where it is not known.
-        lag_ms: f64,
     },
     /// The loop was tuned to another gain or delay of the plant.
     Adapted {

@@ -90,6 +90,7 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
         parts.push(format!("delay {way} by {:.2} ms", more_ms.abs()));
     }
     let hint = match (gain_changed, ratio < 1.0) {
+        (true, true) if more_ms > 1e-6 => "; is there gas in the line?",
         (true, true) => "; is the channel clogging?",
         (true, false) => "; has a constriction opened, or the bead moved to the middle?",
         (false, _) => "; does the camera or the amplifier take longer than the rig file says?",
@@ -138,6 +139,10 @@ mod tests {
         assert_eq!(
             told([1.0, 0.7], 0.0, 40.0),
             "Gain fell to 0.70 over 40.0 s: adapted; is the channel clogging?"
+        );
+        assert_eq!(
+            told([1.0, 0.7], 0.5, 8.0),
+            "Gain fell to 0.70, delay grew by 0.50 ms over 8.0 s: adapted; is there gas in the line?"
         );
         assert_eq!(
             told([1.0, 1.04], 1.0, 0.5),

@@ -200,11 +200,6 @@ fn text(kind: &EventKind) -> String {
             let ticks = plural(count, "tick was", "ticks were");
             format!("{count} {ticks} skipped: the loop was not woken in time.")
         }
-        EventKind::PlantChanged {
-            verdict,
-            gain_ratio,
-            lag_ms,
-        } => plant_changed(&format!("{verdict:?}"), gain_ratio, lag_ms),
         EventKind::Adapted { .. } => adapt::sentence(kind),
         EventKind::StuckStarted => "The bead does not follow the PZT: it sticks.".to_string(),
         EventKind::StuckEnded { lasted_ms } => ended("The bead follows again", lasted_ms),
@@ -286,16 +281,6 @@ fn arming_refused(why: Refusal, gain_ratio: f64) -> String {
         format!("Arming was refused: {why}; the measured gain is {gain_ratio:.2} of the model's.")
     } else {
         format!("Arming was refused: {why}.")
-    }
-}
-
-fn plant_changed(verdict: &str, gain_ratio: f64, lag_ms: f64) -> String {
-    if gain_ratio.is_finite() && lag_ms.is_finite() {
-        format!(
-            "The plant is {verdict}: {gain_ratio:.2} of the model's gain, {lag_ms:.2} ms of lag that it lacks."
-        )
-    } else {
-        format!("The plant is {verdict}.")
     }
 }
 

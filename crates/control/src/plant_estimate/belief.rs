@@ -20,7 +20,10 @@ const GAIN_WALK: f64 = 0.008;
 const CHANGES_PER_S: f64 = 1.0 / 3600.0;
 /// Standard deviation of the logarithm of a gain that is not known: twice and half the model's are usual.
 const GAIN_PRIOR: f64 = LN_2;
-/// Spans of time in which the last change may have come. Neighbours that are least likely become one.
+/// Decay of the belief in a delay that nothing is known of, for a sample of distance from the design's, natural logarithm.
+const DELAY_PRIOR: f64 = 2.0;
+/// Spans of time in which the last change may have come. Neighbours that are least likely become one. With 5 or 16 of them the
+/// loop holds the same.
 const SPANS: usize = 8;
 
 /// A delay of the belief beyond the design's, samples.
@@ -61,7 +64,10 @@ impl Finding {
             }
             (sums[1] / sums[0]).ln()
         };
-        [odds(&|off| off > 0.5 * STEP), odds(&|off| off < -1.5 * STEP)]
+        [
+            odds(&|off| off > 0.5 * STEP),
+            odds(&|off| off < -1.5 * STEP),
+        ]
     }
 }
 
@@ -130,10 +136,12 @@ pub(super) struct Belief {
 impl Belief {
     /// Nothing known. `least` is the least delay beyond the design's, samples.
     pub(super) fn new(least: f64) -> Self {
-        let possible: [f64; DELAYS] =
-            std::array::from_fn(|d| f64::from(u8::from(delay_at(d) > least - 1e-9)));
-        let all: f64 = possible.iter().sum();
-        let prior = possible.map(|p| p / all);
+        let weight = |d: usize| match delay_at(d) {
+            delay if delay < least - 1e-9 => 0.0,
+            delay => (-DELAY_PRIOR * delay.abs()).exp(),
+        };
+        let all: f64 = (0..DELAYS).map(weight).sum();
+        let prior = std::array::from_fn(|d| weight(d) / all);
         let mut spans = [[Part::default(); DELAYS]; SPANS];
         spans[0] = prior.map(Part::unknown);
         Self { prior, spans }
@@ -150,8 +158,7 @@ impl Belief {
         let least = (0..SPANS - 1).min_by(|a, b| both(a).total_cmp(&both(b)));
         let k = least.unwrap_or(0);
         let [one, other] = [self.spans[k], self.spans[k + 1]];
-        self.spans[k] =
-            std::array::from_fn(|d| Part::sum([one[d], other[d]].into_iter()));
+        self.spans[k] = std::array::from_fn(|d| Part::sum([one[d], other[d]].into_iter()));
         self.spans.copy_within(k + 2.., k + 1);
     }
 
@@ -159,9 +166,8 @@ impl Belief {
     fn onward(&mut self, seconds: f64) {
         let change = CHANGES_PER_S * seconds;
         let prior = self.prior;
-        let changed = std::array::from_fn(|d| {
-            Part::unknown(change * (self.delay(d).probability + prior[d]))
-        });
+        let changed =
+            std::array::from_fn(|d| Part::unknown(change * (self.delay(d).probability + prior[d])));
         self.merge();
         for span in &mut self.spans[..SPANS - 1] {
             let any = Part::sum(span.iter().copied());

@@ -3,14 +3,10 @@
 //! All series of the regression pass the same filter, so it changes no gain. Without its predictable part a disturbance hides less of
 //! the dither.
 
-use super::evidence::MEMBERS;
+use super::evidence::{MEMBERS, MEMORY_FIXES, part};
 
 /// Order of the prediction: two for each of three lines, and two for a colour.
 const ORDER: usize = 8;
-/// Memory of the correlations, fixes: a line that drifts by one per cent in that time stays within the notch that it makes.
-const MEMORY_FIXES: f64 = 1000.0;
-/// Residuals are clipped to this number of standard deviations in the correlations.
-const MOST: f64 = 4.0;
 /// Part of the variance that is taken for white: the relative error of a mean over [`MEMORY_FIXES`].
 const WHITE: f64 = 1.0 / MEMORY_FIXES;
 
@@ -59,10 +55,8 @@ impl Colour {
         if chosen_um2 > self.white_um2 {
             return;
         }
-        let most = self.most_um();
-        let left_um = left_um.clamp(-most, most);
         self.fixes += 1.0;
-        let part = 1.0 / (0.2 * MEMORY_FIXES + self.fixes).min(MEMORY_FIXES);
+        let part = part(self.fixes, MEMORY_FIXES);
         let [own, others @ ..] = &mut self.correlations_um2;
         *own += part * (left_um * left_um - *own);
         for (mean, past) in others.iter_mut().zip(self.left_um) {
@@ -70,11 +64,6 @@ impl Colour {
         }
         self.left_um.copy_within(0..ORDER - 1, 1);
         self.left_um[0] = left_um;
-    }
-
-    /// Residuals are clipped to this, um.
-    pub(super) fn most_um(&self) -> f64 {
-        MOST * self.correlations_um2[0].sqrt()
     }
 
     /// The best prediction by the correlations so far (Levinson and Durbin).

@@ -15,14 +15,22 @@ pub(super) const MEMBERS: usize = 4;
 /// Fixes of a block. Whitened binary dither is correlated with itself over 3 ticks; a block of five times that has all but a tenth of
 /// the correlation of neighbouring products.
 const BLOCK: u32 = 16;
-/// Memory of the variance of the products and of how the commands follow the motion that was chosen, blocks: two seconds at 1 kHz, so that
-/// the former is known to 6 %.
-const MEMORY: f64 = 128.0;
+/// Memory of all that is known of the noise, and of how the commands follow the motion that was chosen, fixes: two seconds at 1 kHz. The
+/// variance of the products is then known to 6 %.
+pub(super) const MEMORY_FIXES: f64 = 2048.0;
+const MEMORY: f64 = MEMORY_FIXES / BLOCK as f64;
 /// Standard deviation of the commanded motion over the chosen motion, a lag, before it was seen. The loop leaves the dither alone, so it
 /// answers what a wrong gain makes of it only: half of that in a tick, and the gain is wrong by half.
 const ANSWER: f64 = 0.25;
-/// Blocks after which the variance of the products is known to 25 %, so that they count as evidence.
-const LEARNED: f64 = 8.0;
+/// Blocks that the noise of the design counts as. A block that is farther off than its noise explains is one of a distribution with that many
+/// blocks' degrees of freedom (Student's).
+const STATED: f64 = 8.0;
+
+/// Part of a mean of the noise that a new one of `count` values makes up, with a memory of `memory` values. What the design states counts as
+/// [`STATED`] blocks.
+pub(super) fn part(count: f64, memory: f64) -> f64 {
+    1.0 / (count + STATED / MEMORY * memory).min(memory)
+}
 
 type Vector = [f64; MEMBERS];
 type Matrix = [Vector; MEMBERS];
@@ -102,12 +110,12 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    /// Nothing known. `least` is the least delay beyond the design's, samples.
-    pub(super) fn new(least: f64) -> Self {
+    /// Nothing known. `least` is the least delay beyond the design's, samples; `noise_um2` the variance of a whitened fix.
+    pub(super) fn new(least: f64, noise_um2: f64) -> Self {
         Self {
             block: Block::default(),
             fixes: 0,
-            noise_um2: 0.0,
+            noise_um2,
             blocks: 0.0,
             answer_um2: 0.0,
             recent: Block::default(),
@@ -140,18 +148,18 @@ impl Evidence {
         let e = weights(delay);
         let left: Vector = std::array::from_fn(|i| block.xy[i] - gain * dot(&block.xp[i], &e));
         let white = forward(&l, &left);
-        let left_um2 = dot(&white, &white);
+        let left_um2 = dot(&white, &white) / MEMBERS as f64;
         self.blocks += 1.0;
-        let left_um2 = left_um2 / MEMBERS as f64;
-        self.noise_um2 += (left_um2 - self.noise_um2) / self.blocks.min(MEMORY);
-        let weight = 1.0 / self.noise_um2;
+        let part = part(self.blocks, MEMORY);
+        self.noise_um2 += part * (left_um2 - self.noise_um2);
+        let weight = (STATED + 1.0) / (STATED * self.noise_um2 + left_um2);
         // The commands answer the disturbance, so their products in this block correlate with its noise. How they follow the motion that was
         // chosen is known from the blocks before.
         let answered: Vector =
             std::array::from_fn(|i| dot(&block.xp[i], &e) - dot(&block.xx[i], &e));
         let white = forward(&l, &answered);
         let answer_um2 = dot(&white, &white) / MEMBERS as f64;
-        self.answer_um2 += (answer_um2 - self.answer_um2) / self.blocks.min(MEMORY);
+        self.answer_um2 += part * (answer_um2 - self.answer_um2);
         let answer = self.recent.answer(self.answer_um2);
         let commanded = |delay: f64| -> Vector {
             let e = weights(delay);
@@ -168,10 +176,8 @@ impl Evidence {
             }
         };
         let seconds = f64::from(BLOCK) * fix_s;
-        if self.blocks > LEARNED {
-            let likelihoods = std::array::from_fn(likelihood);
-            self.found = Some(self.belief.observe(&likelihoods, seconds));
-        }
+        let likelihoods = std::array::from_fn(likelihood);
+        self.found = Some(self.belief.observe(&likelihoods, seconds));
         self.recent.take(&block);
     }
 }
@@ -224,7 +230,7 @@ mod tests {
     fn what_the_commands_answer_by_chance_is_not_taken_for_an_answer_to_the_dither() {
         for seed in 0..20 {
             let mut random = Random::new(seed);
-            let mut evidence = Evidence::new(-2.0);
+            let mut evidence = Evidence::new(-2.0, 1e-3);
             let mut x_um = [0.0; MEMBERS];
             let (mut wander_um, mut side_um) = (0.0, 0.0);
             let mut farthest = 0.0_f64;

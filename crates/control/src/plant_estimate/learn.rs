@@ -1,6 +1,6 @@
 //! A fix enters the estimate.
 
-use super::evidence::{MEMBERS, Products, dot, weights};
+use super::evidence::{MEMBERS, MEMORY_FIXES, Products, dot, part, weights};
 use super::retuning::DELAYS;
 use super::whiten::Whitener;
 use super::{AdaptState, Adapter};
@@ -8,8 +8,6 @@ use crate::estimator::Fix;
 
 /// Standard deviations from which on less is taken of a fix (Huber).
 const FAR: f64 = 3.0;
-/// Memory of the mean square that is usually left, fixes: two seconds at 1 kHz.
-const USUAL_FIXES: f64 = 2000.0;
 /// Memory of the mean square that is left now, fixes: three periods of the ringing that a gain that doubled makes.
 const NOW_FIXES: f64 = 60.0;
 /// Mean square of the residual, over the usual one, above which it is larger than noise: ten standard deviations of a mean of
@@ -55,8 +53,8 @@ impl Noise {
         self.n = keep * self.n + 1.0;
         let left2 = (y - gain * p).powi(2);
         self.fixes += 1.0;
-        let part = 1.0 / (self.fixes + 200.0).min(USUAL_FIXES);
-        self.usual_um2 += part * (left2.min(FAR * FAR * self.usual_um2) - self.usual_um2);
+        self.usual_um2 += part(self.fixes, MEMORY_FIXES)
+            * (left2.min(FAR * FAR * self.usual_um2) - self.usual_um2);
         let wrong = self.py - gain * self.pp;
         let surely = wrong > CAUTION * (self.pp * self.usual_um2).sqrt();
         if self.left(gain) > LOUD * self.usual_um2 && surely {
@@ -117,7 +115,7 @@ impl Adapter {
         let usual_um2 = state.noise.usual_um2;
         // The usual mean square may hold a line that is cancelled by now; a bead that is held wanders less than a free one as well.
         let wanders_um2 = usual_um2.min(self.whitener.noise_um2);
-        if state.noise.fixes > 2.0 * NOW_FIXES && state.noise.left(gain) < STILL * wanders_um2 {
+        if state.noise.fixes <= 2.0 * NOW_FIXES || state.noise.left(gain) < STILL * wanders_um2 {
             state.force.wait();
             return false;
         }
@@ -129,8 +127,7 @@ impl Adapter {
         // The error of the model along a reference is not a line.
         let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
         if chosen_um * chosen_um < usual_um2 {
-            let most = state.colour.most_um();
-            let left_um = (y - gain * in_force).clamp(-most, most) / gain;
+            let left_um = (y - gain * in_force) / gain;
             let noise_um2 = state.colour.white_um2 / (gain * gain);
             let shown_ago = delay + late + fix.age as f64 + fix.offset;
             let left = (left_um, noise_um2);

@@ -1,9 +1,10 @@
 //! The tuning follows the estimate.
 //!
-//! Towards caution (more gain than tuned for) at once, towards boldness slowly, and both to the cautious side of the estimate. While the two
-//! agree the tuning settles there, no faster than the estimate itself changes.
+//! Towards caution (more gain than tuned for) at once, towards boldness slowly. While the tuning is within the interval of the estimate it
+//! settles there.
 
 use super::belief::Finding;
+use super::evidence::MEMORY_FIXES;
 use serde::Serialize;
 
 /// Where the tuning stands.
@@ -31,31 +32,17 @@ pub(super) const TUNINGS: usize = 6;
 pub(super) const NOMINAL: usize = 2;
 /// Gains, over the design's, that the law is tuned to.
 const GAINS: [f64; 2] = [0.4, 2.5];
-/// The tuning is for the gain that the plant exceeds with a probability of a third: a gain above the one tuned for costs margin, one below
-/// it a little hold error. Standard deviations of a normal distribution.
-const CAUTIOUS: f64 = 0.43;
-/// Distance from there at which the tuning sets out, standard deviations. If the logarithm is known to [`VAGUE`] only, it is twice that: a
-/// change that is believed in by half, and found wrong in the next second, moves nothing.
-const SET_OUT: f64 = 1.5;
-const VAGUE: f64 = 0.2;
-/// Ticks in which the tuning settles at an estimate that it agrees with: less than the estimate needs to change.
-const SETTLE_TICKS: f64 = 1500.0;
-/// Largest change per tick of the logarithm of the gain in force, upwards and downwards.
-const UP_PER_TICK: f64 = 0.15;
+/// Largest change per tick of the logarithm of the gain in force downwards: half the gain is in force 0.7 s after it is known at 1 kHz.
 const DOWN_PER_TICK: f64 = 0.001;
+/// Standard deviations of a 95 % interval. A tuning outside of it follows the estimate.
+const INTERVAL: f64 = 1.96;
 /// Logarithm of the odds by which a delay in force is too short, or too long: it is outside a 95 % interval.
 const DELAY_SURE: f64 = 3.66;
 /// Logarithm of the odds of a change that is reported: one of 3000 is false if the noise is as it is measured.
 const REPORT_SURE: f64 = 8.0;
-/// The same, standard deviations of a normal distribution.
-const REPORT_SDS: f64 = 3.4;
-/// Ticks between two changes of the delay.
-const DELAY_TICKS: u16 = 20;
 /// A change of the gain that is reported, by its logarithm. The tuning, and a standard deviation of the estimate, must first be within half
 /// of that change of the estimate, so that one step is reported once.
 const REPORTED_GAIN: f64 = 0.14;
-/// Standard deviations of a 95 % interval.
-const INTERVAL: f64 = 1.96;
 
 /// A change of the tuning that a run reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,8 +71,6 @@ pub(super) struct Retuning {
     pub log_gain: f64,
     pub member: usize,
     pub mode: AdaptMode,
-    moving: bool,
-    since_delay: u16,
     reported: Reported,
     /// Ticks since the tuning in force left the one reported last.
     away: u64,
@@ -113,8 +98,6 @@ impl Default for Retuning {
             log_gain: 0.0,
             member: NOMINAL,
             mode: AdaptMode::Learning,
-            moving: false,
-            since_delay: u16::MAX,
             reported: Reported {
                 log_gain: 0.0,
                 log_sd: 0.0,
@@ -129,12 +112,10 @@ impl Retuning {
     /// A tick in which nothing may change.
     pub(super) fn wait(&mut self) {
         self.mode = AdaptMode::Learning;
-        self.moving = false;
     }
 
     /// A tick in which the estimate may come into force.
     pub(super) fn follow(&mut self, found: Option<&Finding>, usable: &[bool; TUNINGS]) {
-        self.since_delay = self.since_delay.saturating_add(1);
         // What is surely less than any plant's is no gain: something holds the bead.
         let of_a_plant = |found: &&Finding| found.gain + found.gain_sd > GAINS[0];
         let Some(found) = found.filter(of_a_plant) else {
@@ -142,22 +123,16 @@ impl Retuning {
             return;
         };
         let sd = found.log_sd;
-        let off = found.log_gain + CAUTIOUS * sd - self.log_gain;
-        let reach = if self.moving {
-            0.0
-        } else {
-            SET_OUT * (1.0 + (sd / VAGUE).powi(2)) * sd
-        };
-        let moving = off.abs() > reach;
-        self.go(if moving { off } else { off / SETTLE_TICKS });
-        self.moving = moving && off < -DOWN_PER_TICK;
+        let off = found.log_gain - self.log_gain;
+        let outside = off.abs() > INTERVAL * sd;
+        self.go(if outside { off } else { off / MEMORY_FIXES });
         // The range ends short of the estimate by more than its uncertainty.
         let beyond = off.abs() > sd && self.log_gain == self.log_gain_after(off);
         self.mode = match self.follow_delay(found, usable) {
             DelayStep::Blocked => AdaptMode::AtLimit,
             _ if beyond => AdaptMode::AtLimit,
             DelayStep::Taken => AdaptMode::Uncertain,
-            DelayStep::None if self.moving => AdaptMode::Uncertain,
+            DelayStep::None if outside => AdaptMode::Uncertain,
             DelayStep::None => AdaptMode::Known,
         };
     }
@@ -169,7 +144,7 @@ impl Retuning {
 
     /// Where that leads, within [`GAINS`].
     fn log_gain_after(&self, way: f64) -> f64 {
-        (self.log_gain + way.clamp(-DOWN_PER_TICK, UP_PER_TICK)).clamp(GAINS[0].ln(), GAINS[1].ln())
+        (self.log_gain + way.max(-DOWN_PER_TICK)).clamp(GAINS[0].ln(), GAINS[1].ln())
     }
 
     fn follow_delay(&mut self, found: &Finding, usable: &[bool; TUNINGS]) -> DelayStep {
@@ -184,11 +159,7 @@ impl Retuning {
         if !usable.get(next).copied().unwrap_or(false) {
             return DelayStep::Blocked;
         }
-        if self.since_delay < DELAY_TICKS {
-            return DelayStep::None;
-        }
         self.member = next;
-        self.since_delay = 0;
         DelayStep::Taken
     }
 
@@ -196,7 +167,8 @@ impl Retuning {
     /// or the delay surely is another one.
     pub(super) fn news(&mut self, found: Option<&Finding>) -> Option<AdaptNews> {
         let before = self.reported;
-        let moved = (self.log_gain - before.log_gain).abs() > 0.02 || self.member != before.member;
+        let moved = (self.log_gain - before.log_gain).abs() > 0.5 * REPORTED_GAIN
+            || self.member != before.member;
         self.away = if moved {
             self.away.saturating_add(1)
         } else {
@@ -204,12 +176,13 @@ impl Retuning {
         };
         let found = found?;
         let off = (found.log_gain - self.log_gain).abs();
-        if self.moving || off.max(found.log_sd) > 0.5 * REPORTED_GAIN {
+        if off.max(found.log_sd) > 0.5 * REPORTED_GAIN {
             return None;
         }
         let change = (found.log_gain - before.log_gain).abs();
-        let farther =
-            0.5 * REPORTED_GAIN + INTERVAL * before.log_sd + REPORT_SDS * found.log_sd;
+        // Odds of a normal distribution, to its second order.
+        let sure = (2.0 * REPORT_SURE).sqrt() * found.log_sd;
+        let farther = 0.5 * REPORTED_GAIN + INTERVAL * before.log_sd + sure;
         let gain = change > REPORTED_GAIN && change > farther;
         let surely_not = |member: usize, sure: f64| {
             let [longer, shorter] = found.delay_odds(DELAYS[member]);

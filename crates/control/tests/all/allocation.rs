@@ -16,7 +16,7 @@ fn mpc(solver: SolverKind) -> ControllerConfig {
 }
 
 /// Allocations of each step of a run with steps of the reference under a tight slew limit, lost frames, late frames, a
-/// freeze, learning and the plant monitor.
+/// freeze and learning.
 fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
     let config = LoopConfig {
         model: LoopModel::eq6(2e-3),
@@ -31,8 +31,6 @@ fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
         },
     };
     let mut rig = SimulatedRig::new(RigConfig::eq6(1)).unwrap();
-    let monitor = PlantMonitor::new(config.estimator, config.model).unwrap();
-    let mut watching = monitor.start(20.0);
     let mut controller = Controller::new(config).unwrap();
     controller.start(20.0, 20.0);
     let mut preview = vec![0.0; controller.preview_len()];
@@ -81,12 +79,6 @@ fn allocations_by_step(controller: ControllerConfig) -> Vec<u64> {
             };
             let out = controller.step(&input);
             learning.learn(Some((fix.position_um, 2.0)), &out.driven);
-            monitor.step(
-                &mut watching,
-                Some(fix.position_um),
-                out.neutral_um,
-                out.command_um,
-            );
             let count = allocations() - before;
             rig.advance(out.command_um);
             count

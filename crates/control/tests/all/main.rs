@@ -10,7 +10,6 @@ mod late_ticks;
 mod learning;
 mod learning_beside_adaptation;
 mod limits;
-mod monitor;
 mod multi_rate;
 mod periodic;
 mod pi_loop;

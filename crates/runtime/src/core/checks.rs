@@ -31,11 +31,9 @@ impl<R: ReferenceGenerator> Core<R> {
         let running = self.state.life == Life::Running;
         for index in tick.index.saturating_sub(skipped.min(most))..tick.index {
             self.controller.skip();
-            let neutral_um = self.controller.neutral_um();
-            let held_um = self.controller.previous_command_um();
-            self.monitor
-                .step(&mut self.state.plant, None, neutral_um, held_um);
-            self.state.following.skip(held_um);
+            self.state
+                .following
+                .skip(self.controller.previous_command_um());
             let told = ReferenceInput {
                 running,
                 frozen: self.state.frozen.any(),

@@ -1,4 +1,4 @@
-//! What is watched besides the bead: whether it follows the commands, and what its motion tells of the plant.
+//! What is watched besides the bead: whether it follows the commands.
 
 use super::Core;
 use super::following::{Instead, Seen};
@@ -98,32 +98,6 @@ impl<R: ReferenceGenerator> Core<R> {
                 tick.event(EventKind::ActuatorClipped { level_um: rest_um });
                 self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
             }
-        }
-    }
-
-    /// Gain and lag of the plant from its motion; their changes are events.
-    pub(super) fn watch_plant(
-        &mut self,
-        fix: Option<LoopMeasurement>,
-        output: &LoopOutput,
-        tick: &mut Tick,
-    ) {
-        // Increments are those of one tick only between frames that are on time.
-        let on_time = fix.filter(|fix| fix.age_samples == 0 && fix.offset_samples.abs() < 0.2);
-        let before = self.monitor.verdict(&self.state.plant);
-        let verdict = self.monitor.step(
-            &mut self.state.plant,
-            on_time.map(|fix| fix.position_um),
-            output.neutral_um,
-            output.command_um,
-        );
-        if verdict != before && self.state.life == Life::Running {
-            let estimate = self.monitor.estimate(&self.state.plant);
-            tick.event(EventKind::PlantChanged {
-                verdict,
-                gain_ratio: estimate.map_or(f64::NAN, |e| e.gain_ratio),
-                lag_ms: estimate.map_or(f64::NAN, |e| e.lag_ms),
-            });
         }
     }
 }
