@@ -4,7 +4,6 @@
 //! settles there.
 
 use super::belief::Finding;
-use super::evidence::MEMORY_FIXES;
 use serde::Serialize;
 
 /// Where the tuning stands.
@@ -34,8 +33,11 @@ pub(super) const NOMINAL: usize = 2;
 const GAINS: [f64; 2] = [0.4, 2.5];
 /// Largest change per tick of the logarithm of the gain in force downwards: half the gain is in force 0.7 s after it is known at 1 kHz.
 const DOWN_PER_TICK: f64 = 0.001;
-/// Standard deviations of a 95 % interval. A tuning outside of it follows the estimate.
+/// Standard deviations of a 95 % interval. A tuning outside of it follows the estimate at once.
 const INTERVAL: f64 = 1.96;
+/// Ticks in which a tuning inside of it settles at the estimate: longer than a belief in a change that the next blocks refute, less than
+/// the 28 s that the estimate remembers.
+const SETTLE_TICKS: f64 = 500.0;
 /// Logarithm of the odds by which a delay in force is too short, or too long: it is outside a 95 % interval.
 const DELAY_SURE: f64 = 3.66;
 /// Logarithm of the odds of a change that is reported: one of 3000 is false if the noise is as it is measured.
@@ -125,7 +127,7 @@ impl Retuning {
         let sd = found.log_sd;
         let off = found.log_gain - self.log_gain;
         let outside = off.abs() > INTERVAL * sd;
-        self.go(if outside { off } else { off / MEMORY_FIXES });
+        self.go(if outside { off } else { off / SETTLE_TICKS });
         // The range ends short of the estimate by more than its uncertainty.
         let beyond = off.abs() > sd && self.log_gain == self.log_gain_after(off);
         self.mode = match self.follow_delay(found, usable) {
