@@ -5,7 +5,7 @@
 //! explains it best (change-point detection by Bayes). So a change is found as soon as it explains the fixes better than chance does at the
 //! stated rate of changes, and there is no search that could raise a false alarm.
 
-use super::evidence::{LAGS, MEMBERS};
+use super::motion::{LAGS, MEMBERS};
 use std::f64::consts::LN_2;
 
 /// Step of the delays, samples: half the standard deviation that a dither of one per cent of hold error leaves after 10 s.

@@ -3,7 +3,8 @@
 //! All series of the regression pass the same filter, so it changes no gain. Without its predictable part a disturbance hides less of
 //! the dither.
 
-use super::evidence::{MEMBERS, MEMORY_FIXES, part};
+use super::evidence::{MEMORY_FIXES, part};
+use super::motion::MEMBERS;
 
 /// Order of the prediction: two for each of three lines, and two for a colour.
 const ORDER: usize = 8;

@@ -6,12 +6,8 @@
 //! That variance is measured in blocks that are longer than the correlation of `x`, so it includes the colour of the disturbance.
 
 use super::belief::{Belief, Finding, Likelihood, delay_at};
+use super::motion::{LAGS, MEMBERS};
 
-/// Lags of the instrument beyond the design's delay, samples. A position between two ticks is on the line through them, so that
-/// any delay between the first and the last is in their span.
-pub(super) const LAGS: [f64; MEMBERS] = [-1.0, 0.0, 1.0, 2.0];
-/// How many.
-pub(super) const MEMBERS: usize = 4;
 /// Fixes of a block. Whitened binary dither is correlated with itself over 3 ticks; a block of five times that has all but a tenth of
 /// the correlation of neighbouring products.
 const BLOCK: u32 = 16;

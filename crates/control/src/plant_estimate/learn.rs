@@ -1,6 +1,7 @@
 //! A fix enters the estimate.
 
-use super::evidence::{MEMBERS, MEMORY_FIXES, Products, dot, part, weights};
+use super::evidence::{MEMORY_FIXES, Products, dot, part, weights};
+use super::motion::MEMBERS;
 use super::retuning::DELAYS;
 use super::whiten::Whitener;
 use super::{AdaptState, Adapter};

@@ -1,9 +1,14 @@
 //! A model driven by the commands, and the innovations of its motion.
 
-use super::evidence::{LAGS, MEMBERS};
 use super::whiten::{Correction, Track, Whitener};
 use crate::estimator::{Estimator, Fix, PredictedState};
 use crate::exposure::Past;
+
+/// Lags of the instrument beyond the design's delay, samples. A position between two ticks is on the line through them, so that
+/// any delay between the first and the last is in their span.
+pub(super) const LAGS: [f64; MEMBERS] = [-1.0, 0.0, 1.0, 2.0];
+/// How many.
+pub(super) const MEMBERS: usize = 4;
 
 /// The model and its recent positions, and each delay's series in the filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
