@@ -157,6 +157,8 @@ impl<L: ControlLaw> ControlLoop<L> {
         };
         adapter.step(adapt, told);
         let (now, to) = (adapter.tuning(adapt), adapter.estimator(adapt));
+        let stated = self.parts.estimator.gain_uncertainty;
+        state.estimator.gain_doubt = adapter.gain_doubt(adapt, stated);
         if from.model() != to.model() {
             from.retime(&mut state.estimator, to);
         }

@@ -71,6 +71,8 @@ pub struct EstimatorState {
     pub still: StillBead,
     /// Variance per tick that a wrong gain may cause, um^2.
     pub spread_um2: f64,
+    /// Part of the stated uncertainty of the gain that is left; 1 where nothing more is known of it.
+    pub gain_doubt: f64,
     /// Ticks by which the filter's time lies behind the nominal delay.
     pub lag: u8,
     /// Refused measurements in a row.
@@ -195,6 +197,7 @@ impl Estimator {
             stuck_evidence: 0.0,
             still: StillBead::default(),
             spread_um2: 0.0,
+            gain_doubt: 1.0,
             lag: 0,
             gated: 0,
             ticks_since_fix: 0,
@@ -265,7 +268,8 @@ impl Estimator {
         state.integrator_um = next.q;
         state.modes = next.modes;
         let g = self.tick.gain;
-        let spread = self.config.gain_uncertainty * self.net_motion(state, back, m.n);
+        let unsure = self.config.gain_uncertainty * state.gain_doubt;
+        let spread = unsure * self.net_motion(state, back, m.n);
         // It rises at once and falls slowly, so that it follows the crests: a filter whose gain rose and fell within each
         // cycle of a motion would rectify the innovations of that cycle into a false neutral.
         let crest = (SPREAD_KEPT * state.spread_um2).max(spread * spread);

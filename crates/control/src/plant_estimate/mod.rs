@@ -50,6 +50,9 @@ pub const ADAPT_COLUMNS: [&str; 6] = [
 /// estimate reaches it. Under a strong disturbance and just after a change the dither costs up to four times as much for some seconds.
 const KNOWN: f64 = 0.04;
 const LOUDEST: f64 = 2.0;
+/// Part of the stated uncertainty of the gain that stays, whatever is found.
+const LEAST_DOUBT: f64 = 0.1;
+
 /// Where adaptation stands.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Adaptation {
@@ -198,6 +201,21 @@ impl Adapter {
             gain: state.force.log_gain.exp(),
             delay: (design + DELAYS[state.force.member]) / design,
         }
+    }
+
+    /// Uncertainty of the gain in force as a part of `stated`: two standard deviations of the estimate, plus its distance from the gain in
+    /// force. 1 before the gain was measured.
+    pub(crate) fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
+        let sure = state.force.mode != AdaptMode::Learning;
+        let Some(found) = state
+            .evidence
+            .found
+            .filter(|found| sure && found.gain > 0.0)
+        else {
+            return 1.0;
+        };
+        let off = (found.log_gain - state.force.log_gain).abs();
+        ((off + 2.0 * found.log_sd) / stated.max(1e-3)).clamp(LEAST_DOUBT, 1.0)
     }
 
     /// What is to be added to the command of this tick, um.
