@@ -1,6 +1,6 @@
 //! Several simulated runs at once: `--parallel N` of the tables.
 
-pub use cellpos_parallel::map;
+pub use cellpos_numeric::parallel::map;
 
 /// Value of `--NAME VALUE` or `--NAME=VALUE` among the arguments of the program; `default` without it.
 ///
@@ -25,5 +25,5 @@ pub fn option(name: &str, default: u64) -> u64 {
 
 /// Threads that `--parallel` requests; 1 without it, all cores for 0.
 pub fn threads() -> usize {
-    cellpos_parallel::threads(usize::try_from(option("--parallel", 1)).unwrap_or(1))
+    cellpos_numeric::parallel::threads(usize::try_from(option("--parallel", 1)).unwrap_or(1))
 }

@@ -1,7 +1,7 @@
 //! Arguments that need more than their type: run folders (a path, or `latest`), quantities above zero, values that begin with
 //! a minus.
 
-use cellpos_units::Seconds;
+use cellpos_numeric::units::Seconds;
 use clap::builder::{OsStringValueParser, TypedValueParser};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -207,16 +207,19 @@ mod tests {
             "-5",
         ];
         assert_eq!(joined, expected.map(OsString::from));
-        assert!(positive::<cellpos_units::Seconds>("-3s").is_err());
+        assert!(positive::<cellpos_numeric::units::Seconds>("-3s").is_err());
         assert!(
-            positive::<cellpos_units::Seconds>("3")
+            positive::<cellpos_numeric::units::Seconds>("3")
                 .unwrap_err()
                 .contains("unit")
         );
         assert!(loop_delay("2.5").unwrap_err().contains("2.5ms"));
-        assert_eq!(loop_delay("2.5ms"), Ok(cellpos_units::Seconds(0.0025)));
+        assert_eq!(
+            loop_delay("2.5ms"),
+            Ok(cellpos_numeric::units::Seconds(0.0025))
+        );
         assert!(loop_delay("-1ms").is_err() && loop_delay("ms").is_err());
-        assert_eq!(positive("3s"), Ok(cellpos_units::Seconds(3.0)));
+        assert_eq!(positive("3s"), Ok(cellpos_numeric::units::Seconds(3.0)));
         assert_eq!(span(Seconds(0.5)), Duration::from_millis(500));
         assert_eq!(span(Seconds(1e30)).as_secs(), 1_000_000_000);
     }

@@ -110,7 +110,7 @@ fn text_error(text: &str, file: &str, error: &toml::de::Error) -> ConfigError {
         line,
         column,
         written,
-        suggestion: cellpos_units::nearest_in(&message).map(str::to_owned),
+        suggestion: cellpos_numeric::units::nearest_in(&message).map(str::to_owned),
         message,
     }
 }

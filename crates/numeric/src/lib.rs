@@ -1,4 +1,4 @@
-//! Arithmetic that several crates share: seeded random numbers, order statistics, distributions.
+//! Numbers as every crate uses them: [`units`], seeded random numbers, order [`statistics`], distributions, and a [`parallel`] map.
 //!
 //! Each exists once here, so that two crates cannot disagree about the meaning of a quantile or a seed. It is not a
 //! statistics library: distribution functions come from `statrs`.
@@ -11,7 +11,9 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod parallel;
 mod random;
 pub mod statistics;
+pub mod units;
 
 pub use random::Random;

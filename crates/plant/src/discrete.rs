@@ -9,7 +9,7 @@ use crate::modal::{Zpk, residues, separate};
 use crate::phi::phi;
 use crate::roots;
 use crate::transfer::TransferFunction;
-use cellpos_units::{Hertz, Seconds};
+use cellpos_numeric::units::{Hertz, Seconds};
 use nalgebra::{Complex, DMatrix, DVector, RowDVector};
 use std::f64::consts::TAU;
 

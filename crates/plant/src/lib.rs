@@ -42,7 +42,7 @@ mod state_space;
 mod transfer;
 mod words;
 
-pub use cellpos_units::{Decibels, Degrees, Hertz, Micrometers, Seconds};
+pub use cellpos_numeric::units::{Decibels, Degrees, Hertz, Micrometers, Seconds};
 pub use chain::{Chain, ChainError, TiedPlant};
 pub use discrete::{DiscretePlant, DiscreteState};
 pub use effects::{Effect, EffectError, Parameter, Place};

@@ -4,7 +4,7 @@
 use crate::effects::{Action, Effect, Place};
 use crate::error::{ModelError, ModelProblem};
 use crate::transfer::TransferFunction;
-use cellpos_units::Hertz;
+use cellpos_numeric::units::Hertz;
 use nalgebra::Complex;
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;

@@ -5,7 +5,7 @@
 
 use crate::error::PlantError;
 use crate::transfer::TransferFunction;
-use cellpos_units::Hertz;
+use cellpos_numeric::units::Hertz;
 use nalgebra::Complex;
 use std::f64::consts::TAU;
 

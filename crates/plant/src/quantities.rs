@@ -3,7 +3,7 @@
 //! The text is rewritten to bare numbers before it is read, line for line, so that every later message names the right line.
 //! Which keys of a file are quantities its owner says ([`Quantity`]); everything else is left as it stands.
 
-use cellpos_units::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Seconds};
+use cellpos_numeric::units::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::ops::Range;
 use toml::de::{DeTable, DeValue};
 

@@ -2,7 +2,7 @@
 
 use crate::error::PlantError;
 use crate::roots;
-use cellpos_units::{Decibels, Degrees, Hertz};
+use cellpos_numeric::units::{Decibels, Degrees, Hertz};
 use nalgebra::Complex;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;

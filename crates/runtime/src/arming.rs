@@ -9,8 +9,8 @@
 //! with the ones before.
 
 use crate::life::Refusal;
+use cellpos_numeric::units::Seconds;
 use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
-use cellpos_units::Seconds;
 use serde::{Deserialize, Serialize};
 
 /// How arming goes. In TOML every key may be left out.

@@ -43,9 +43,9 @@ use cellpos_control::{
     Controller, CycleLearning, LoopConfig, LoopInput, LoopOutput, Measurement as LoopMeasurement,
     Mode, Partner, SolverStatus, SolverTerms,
 };
+use cellpos_numeric::units::Seconds;
 use cellpos_plant::TransferFunction;
 use cellpos_rig::ActuatorReport;
-use cellpos_units::Seconds;
 use std::ops::Range;
 
 #[derive(Debug, Clone, Copy, PartialEq)]

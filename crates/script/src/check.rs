@@ -7,8 +7,8 @@ use crate::error::ScriptError;
 use crate::plan::{Motion, Plan, Segment};
 use crate::script::{Script, WaveShape};
 use cellpos_control::Reference;
+use cellpos_numeric::units::Seconds;
 use cellpos_plant::{DiscretePlant, Model, PlantError};
-use cellpos_units::Seconds;
 
 /// What the rig can do.
 #[derive(Debug, Clone, Copy, PartialEq)]

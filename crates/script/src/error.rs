@@ -47,7 +47,7 @@ impl ScriptError {
 
 /// The candidate nearest to a misspelt word, if one is near.
 pub(crate) fn nearest<'a>(word: &str, candidates: &[&'a str]) -> Option<&'a str> {
-    cellpos_units::nearest(word, candidates.iter().copied())
+    cellpos_numeric::units::nearest(word, candidates.iter().copied())
 }
 
 #[cfg(test)]

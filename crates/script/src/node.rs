@@ -1,7 +1,7 @@
 //! Typed access to a TOML table, with the place of every value for errors.
 
 use crate::error::{ScriptError, nearest};
-use cellpos_units::{Micrometers, Seconds, UnitError};
+use cellpos_numeric::units::{Micrometers, Seconds, UnitError};
 use std::ops::Range;
 use std::str::FromStr;
 use toml::Spanned;

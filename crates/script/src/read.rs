@@ -6,8 +6,8 @@ use crate::script::{
     Condition, Load, MoveShape, OnTimeout, Order, Script, Step, StepKind, WaveShape,
 };
 use crate::shuffle::shuffle;
+use cellpos_numeric::units::{Hertz, MicrometersPerSecond};
 use cellpos_table::{ColumnRef, Table, read_text};
-use cellpos_units::{Hertz, MicrometersPerSecond};
 use std::path::Path;
 use toml::de::DeTable;
 

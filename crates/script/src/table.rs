@@ -4,7 +4,7 @@ use crate::error::ScriptError;
 use crate::node::{Node, length, time};
 use crate::sample::Sample;
 use crate::script::{ClipWishes, Stop};
-use cellpos_units::Micrometers;
+use cellpos_numeric::units::Micrometers;
 
 /// The table `[stop]`.
 pub(crate) fn stop(root: &Node) -> Result<Stop, ScriptError> {

@@ -10,7 +10,7 @@ use cellpos_control::{
     CycleLearning, HarmonicResponse, LearnConfig, LearnError, LearnedTable, Learner, Profile,
     Reference, Shape,
 };
-use cellpos_units::{Hertz, Micrometers};
+use cellpos_numeric::units::{Hertz, Micrometers};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::str::FromStr;

@@ -27,7 +27,7 @@ pub fn parse<T: DeserializeOwned>(text: &str, name: &str) -> Result<T, Failure> 
         let message = cellpos_plant::in_words(error.message());
         let span = error.span().unwrap_or(0..0);
         let line = Position::of(text, span.clone()).line;
-        let help = match (missing, cellpos_units::nearest_in(&message)) {
+        let help = match (missing, cellpos_numeric::units::nearest_in(&message)) {
             (Some(key), _) => format!(
                 "write {key} = ... into this table, or leave a table of a rig.toml out for the emulated rig's; the files under \
                  examples/ are commented"

@@ -3,9 +3,9 @@
 use super::ProgramError;
 use cellpos_emulator::BoardConfig;
 use cellpos_emulator::{FaultKind, Faults, QUANTITIES, WorldConfig};
+use cellpos_numeric::units::{Hertz, Micrometers, Seconds};
 use cellpos_plant::Model;
 use cellpos_plant::quantities::bare;
-use cellpos_units::{Hertz, Micrometers, Seconds};
 use clap::Parser;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};

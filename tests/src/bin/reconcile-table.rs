@@ -102,12 +102,13 @@ fn selected(which: &str, seed: u64) -> Vec<(Case, u64)> {
 /// Runs all cases on all cores and prints a line for each as it ends.
 fn evaluated(cases: &[(Case, u64)]) -> BTreeMap<usize, Result<Row, String>> {
     let numbered: Vec<usize> = (0..cases.len()).collect();
-    let rows = cellpos_parallel::map(&numbered, cellpos_parallel::threads(0), |&i| {
-        let (case, seed) = &cases[i];
-        let row = evaluate(case, *seed);
-        println!("{}", line(case, &row));
-        row
-    });
+    let rows =
+        cellpos_numeric::parallel::map(&numbered, cellpos_numeric::parallel::threads(0), |&i| {
+            let (case, seed) = &cases[i];
+            let row = evaluate(case, *seed);
+            println!("{}", line(case, &row));
+            row
+        });
     rows.into_iter().enumerate().collect()
 }
 

@@ -3,8 +3,8 @@
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::RigFile;
 use cellpos_drivers::CalibrationFile;
+use cellpos_numeric::units::Micrometers;
 use cellpos_plant::{Hertz, Model};
-use cellpos_units::Micrometers;
 use cellpos_workbench::Bench;
 use cellpos_workbench::calibrate::{self, Pulses, Response};
 use cellpos_workbench::snapshot;

@@ -2,8 +2,8 @@
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_drivers::sources::{self, Playback, Region};
+use cellpos_numeric::units::Seconds;
 use cellpos_rig::{Camera, CameraError, Clock, FrameBuffer};
-use cellpos_units::Seconds;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;

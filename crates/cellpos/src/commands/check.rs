@@ -4,10 +4,10 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use crate::rig_file::RigFile;
 use crate::setup;
+use cellpos_numeric::units::{Micrometers, MicrometersPerSecond};
 use cellpos_plant::Model;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{Check, CheckLimits, Script, check};
-use cellpos_units::{Micrometers, MicrometersPerSecond};
 use std::path::PathBuf;
 
 /// Arguments of `cellpos check`.

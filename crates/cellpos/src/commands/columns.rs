@@ -2,9 +2,9 @@
 
 use super::arrays::read_table;
 use crate::outcome::Failure;
+use cellpos_numeric::units::Hertz;
 use cellpos_reconcile::Record;
 use cellpos_table::{ColumnRef, Table};
-use cellpos_units::Hertz;
 use cellpos_workbench::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, refused};
 use std::path::Path;
 

@@ -14,8 +14,8 @@ use cellpos_control::design::{
 use cellpos_control::{
     ConfigError, ControllerConfig, ControllerFile, ControllerKind, Lead, Lqg, Mpc, Pi,
 };
+use cellpos_numeric::units::{Hertz, Seconds};
 use cellpos_plant::Model;
-use cellpos_units::{Hertz, Seconds};
 use std::path::{Path, PathBuf};
 
 /// Which controller is meant: a law to design, or a file to check.
@@ -130,7 +130,7 @@ pub(crate) struct Args {
     stable_over_spread: bool,
     /// Localisation noise for the predicted errors; default: the model's (30 nm in eq6).
     #[arg(long)]
-    fix_noise: Option<cellpos_units::Micrometers>,
+    fix_noise: Option<cellpos_numeric::units::Micrometers>,
     /// Write the controller to this file.
     #[arg(long)]
     out: Option<PathBuf>,

@@ -2,8 +2,8 @@
 
 use crate::arguments::{positive, span};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use cellpos_numeric::units::Seconds;
 use cellpos_session::signals;
-use cellpos_units::Seconds;
 use cellpos_workbench::doctor::{self, Examination, LATE_NS, Weight};
 use std::path::PathBuf;
 

@@ -4,8 +4,8 @@ use super::beside;
 use crate::arguments::run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
+use cellpos_numeric::units::Seconds;
 use cellpos_record::{Exported, Format, RecordError, Selection, Sessions, export};
-use cellpos_units::Seconds;
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
 

@@ -3,8 +3,8 @@
 use crate::arguments::positive;
 use crate::outcome::{CommandResult, Outcome, print_json, print_text};
 use crate::rig_file::{ClockKind, Frames, RigFile};
+use cellpos_numeric::units::{Micrometers, Seconds};
 use cellpos_plant::Model;
-use cellpos_units::{Micrometers, Seconds};
 use cellpos_workbench::experiment::on_rig::OnRig;
 use cellpos_workbench::experiment::partner::{Measured, Moves, measure};
 use cellpos_workbench::partner::write_partner;

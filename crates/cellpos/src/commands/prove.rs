@@ -3,11 +3,11 @@
 use crate::arguments::positive;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::{ActuatorConfig, CameraConfig, Frames, RigFile};
+use cellpos_numeric::units::{Micrometers, Seconds};
 use cellpos_plant::Model;
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_session::connect::describe;
 use cellpos_session::signals;
-use cellpos_units::{Micrometers, Seconds};
 use cellpos_workbench::Bench;
 use cellpos_workbench::doctor;
 use cellpos_workbench::experiment::on_rig::OnRig;

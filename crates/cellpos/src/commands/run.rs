@@ -21,6 +21,7 @@ use crate::notify::NotifyArgs;
 use crate::outcome::{CommandResult, Failure, Outcome, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_emulator::{CellConfig, FaultKind};
+use cellpos_numeric::units::Micrometers;
 use cellpos_record::{InputFile, LineFile, RunWriter};
 use cellpos_runtime::EndRule;
 use cellpos_script::{
@@ -33,7 +34,6 @@ use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames,
 use cellpos_session::setup::{self, Prepared, Setup};
 use cellpos_session::view::{Page, Viewed};
 use cellpos_session::{Options, Rig, connect};
-use cellpos_units::Micrometers;
 use learning::Keeper;
 use over::{Over, Telling};
 use ready::Ready;

@@ -40,8 +40,8 @@ pub(crate) struct Args {
     #[arg(long, requires = "input_column")]
     time_column: Option<String>,
     /// Sampling rate of a record without a time column.
-    #[arg(long, requires = "input_column", value_parser = crate::arguments::positive::<cellpos_units::Hertz>)]
-    rate: Option<cellpos_units::Hertz>,
+    #[arg(long, requires = "input_column", value_parser = crate::arguments::positive::<cellpos_numeric::units::Hertz>)]
+    rate: Option<cellpos_numeric::units::Hertz>,
     /// Input between rows [default: as the model was identified, else zero-order].
     #[arg(long, value_enum)]
     hold: Option<HoldKind>,

@@ -11,6 +11,7 @@ use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_control::{ControllerFile, ControllerKind, LearnedTable, SolverKind};
+use cellpos_numeric::units::{Micrometers, Seconds};
 use cellpos_record::RunWriter;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Summary};
@@ -25,7 +26,6 @@ use cellpos_session::setup::{self, Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, View, Viewed};
 use cellpos_session::words::of_what_is_followed;
 use cellpos_session::{EndKind, Ended, Finished, Options, Rig, connect};
-use cellpos_units::{Micrometers, Seconds};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

@@ -2,8 +2,8 @@
 
 use crate::arguments::{positive, run_folder, span};
 use crate::outcome::{CommandResult, Outcome};
+use cellpos_numeric::units::Seconds;
 use cellpos_session::view::{ViewAddress, Watch};
-use cellpos_units::Seconds;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};

@@ -169,5 +169,5 @@ impl<'a, 'i> Table<'a, 'i> {
 
 /// The known name nearest to a misspelt one, if it is near enough to be meant.
 pub(super) fn nearest(name: &str, known: &[&str]) -> Option<String> {
-    cellpos_units::nearest(name, known.iter().copied()).map(str::to_owned)
+    cellpos_numeric::units::nearest(name, known.iter().copied()).map(str::to_owned)
 }

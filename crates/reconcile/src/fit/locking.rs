@@ -161,7 +161,7 @@ pub(crate) fn refine(
             zero_flow: None,
         };
         let grid = Grid::new(&noise, wave, pixel)?;
-        Some(cellpos_parallel::map(&tracks, threads, |t| {
+        Some(cellpos_numeric::parallel::map(&tracks, threads, |t| {
             grid.rows(t, wave, pixel)
         }))
     };

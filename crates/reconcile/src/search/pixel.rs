@@ -63,7 +63,7 @@ pub(crate) fn pixel_scan(
     let knots: Vec<f64> = (0..9)
         .map(|i| WAVES.0 * (WAVES.1 / WAVES.0).powf(f64::from(i) / 8.0))
         .collect();
-    let energy = cellpos_parallel::map(&knots, threads, |&q| {
+    let energy = cellpos_numeric::parallel::map(&knots, threads, |&q| {
         let (s, c, _) = columns(q);
         0.5 * (s.iter().chain(&c).map(|x| x * x).sum::<f64>())
     });
@@ -93,7 +93,7 @@ pub(crate) fn pixel_scan(
     let fine: Vec<f64> = (-8..=8)
         .map(|i| centre + step * f64::from(i) / 8.0)
         .collect();
-    let gains = cellpos_parallel::map(&fine, threads, |&q| {
+    let gains = cellpos_numeric::parallel::map(&fine, threads, |&q| {
         let (s, c, e) = columns(q);
         pair_score(&s, &c, &e)
     });

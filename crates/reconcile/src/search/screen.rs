@@ -27,7 +27,7 @@ pub(crate) fn screen(
         }
     }
     let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
-    let scores = cellpos_parallel::map(&jobs, threads, |part| match part.variant().role {
+    let scores = cellpos_numeric::parallel::map(&jobs, threads, |part| match part.variant().role {
         Role::Line => line_score(ctx, fit, part.natural()[0], mask),
         _ => {
             let mut parts = fit.parts.clone();

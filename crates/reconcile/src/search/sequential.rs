@@ -88,7 +88,7 @@ pub(crate) fn extensions(
     });
     let worth: Vec<Part> = worth.take(wide).collect();
     // A short fit of all, then the best few to the end.
-    let mut fits = cellpos_parallel::map(&worth, effort.threads, |part| {
+    let mut fits = cellpos_numeric::parallel::map(&worth, effort.threads, |part| {
         let mut parts = fit.parts.clone();
         parts.push(part.clone());
         ctx.fit_from(parts, Some(fit.soft), mask, 4)
@@ -105,7 +105,7 @@ pub(crate) fn extensions(
         iterations: 14,
         least_chi2: target.min(rival_of),
     };
-    let mut fits = cellpos_parallel::map(&fits, effort.threads, |f| {
+    let mut fits = cellpos_numeric::parallel::map(&fits, effort.threads, |f| {
         // Steps become smaller: what is out of reach with steps like the last is out of reach.
         if f.chi2 - f.last_gain * until.iterations as f64 > until.least_chi2 {
             f.clone()
@@ -129,14 +129,14 @@ fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&
         v.is_own() && !ctx.excludes(v.id()) && !fit.has(v.id()) && !forbidden.contains(&v.id())
     }) {
         let starts = variant.starts(&ctx.scope);
-        let fits = cellpos_parallel::map(&starts, effort.threads, |part| {
+        let fits = cellpos_numeric::parallel::map(&starts, effort.threads, |part| {
             let mut parts = fit.parts.clone();
             parts.push(part.clone());
             ctx.fit_from(parts, Some(fit.soft), mask, SHORT)
         });
         best.extend(fits.into_iter().min_by(|a, b| a.chi2.total_cmp(&b.chi2)));
     }
-    cellpos_parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
+    cellpos_numeric::parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
 }
 
 /// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is what the forms of `smaller` began from.
@@ -160,7 +160,7 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: &Fit, mask: &Mask, effort: E
     let null = before_forms(ctx, null, &fit, mask);
     while fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..fit.parts.len()).collect();
-        let without = cellpos_parallel::map(&indices, effort.threads, |&i| {
+        let without = cellpos_numeric::parallel::map(&indices, effort.threads, |&i| {
             let mut parts = fit.parts.clone();
             parts.remove(i);
             // Only whether it comes so far down that the part was worth nothing is asked.
@@ -250,7 +250,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                         .collect()
                 })
                 .unwrap_or_default();
-            for other in cellpos_parallel::map(&twins, effort.threads, |part| {
+            for other in cellpos_numeric::parallel::map(&twins, effort.threads, |part| {
                 let mut parts = fit.parts.clone();
                 parts[i] = part.clone();
                 let until = Until {
@@ -295,7 +295,7 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
             })
             .flat_map(|v| v.starts_from(&fit.parts[i], &ctx.scope))
             .collect();
-        let fits = cellpos_parallel::map(&others, effort.threads, |part| {
+        let fits = cellpos_numeric::parallel::map(&others, effort.threads, |part| {
             let mut parts = fit.parts.clone();
             parts[i] = part.clone();
             let until = Until {

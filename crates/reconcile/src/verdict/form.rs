@@ -41,7 +41,7 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
     one_form(ctx, found, &mut aside, threads);
     while found.fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..found.fit.parts.len()).collect();
-        let without = cellpos_parallel::map(&indices, threads, |&i| {
+        let without = cellpos_numeric::parallel::map(&indices, threads, |&i| {
             let mut parts = found.fit.parts.clone();
             parts.remove(i);
             ctx.fit_from(parts, Some(found.fit.soft), &all, ROUNDS)
@@ -85,7 +85,7 @@ fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: us
         return;
     }
     let indices: Vec<usize> = (0..count).collect();
-    let alone = cellpos_parallel::map(&indices, threads, |&i| {
+    let alone = cellpos_numeric::parallel::map(&indices, threads, |&i| {
         let part = found.fit.parts[i].clone();
         ctx.fit_from(vec![part], Some(found.fit.soft), &all, ROUNDS)
     });

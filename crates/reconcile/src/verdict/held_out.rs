@@ -113,7 +113,7 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
     // by the end.
     // Amplitudes and phases of lines are each record's own: kept.
     let folds: Vec<usize> = (0..records.len()).collect();
-    let results = cellpos_parallel::map(&folds, threads, |&i| {
+    let results = cellpos_numeric::parallel::map(&folds, threads, |&i| {
         let mut others = ctx.problem.all();
         let mut own: Mask = vec![Vec::new(); records.len()];
         std::mem::swap(&mut others[i], &mut own[i]);
@@ -203,7 +203,7 @@ fn unconfirmed(
         .map(|(train, test)| ctx.refit(fit, train, ROUNDS).chi2_on(test))
         .collect();
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
-    let fails = cellpos_parallel::map(&indices, threads, |&i| {
+    let fails = cellpos_numeric::parallel::map(&indices, threads, |&i| {
         let mut parts = fit.parts.clone();
         parts.remove(i);
         let gains = splits.iter().zip(&whole).map(|((train, test), whole)| {

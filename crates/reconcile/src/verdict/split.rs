@@ -60,7 +60,8 @@ pub(crate) fn birge(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<f64> {
     if groups.len() < 2 {
         return vec![1.0; numbers];
     }
-    let fits = cellpos_parallel::map(&groups, threads, |(_, mask)| ctx.refit(fit, mask, 6));
+    let fits =
+        cellpos_numeric::parallel::map(&groups, threads, |(_, mask)| ctx.refit(fit, mask, 6));
     let mut ratios = Vec::with_capacity(numbers);
     let mut at = 0;
     for (i, part) in fit.parts.iter().enumerate() {
@@ -115,7 +116,7 @@ pub(crate) fn disagreement(
     let gained = (null.chi2 - fit.chi2).max(0.0);
     let mut of_shape = None;
     for groups in groupings(ctx) {
-        let fits = cellpos_parallel::map(&groups, threads, |(_, mask)| {
+        let fits = cellpos_numeric::parallel::map(&groups, threads, |(_, mask)| {
             (fit.chi2_on(mask), ctx.refit(fit, mask, 6))
         });
         let freedom = (numbers + 1) * (groups.len() - 1);

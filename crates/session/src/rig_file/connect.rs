@@ -9,9 +9,9 @@ use cellpos_drivers::{
     BoardHost, Calibration, CommandedFlow, FlowTap, Followed, Pair, Port, VisionSource,
 };
 use cellpos_emulator::EmulatedRig;
+use cellpos_numeric::units::Hertz;
 use cellpos_plant::Model;
 use cellpos_rig::{Actuator, Camera, Clock, PositionSource};
-use cellpos_units::Hertz;
 use cellpos_vision::{CellTracker, Tracker, TrackerConfig};
 use std::time::Duration;
 

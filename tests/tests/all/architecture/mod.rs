@@ -330,30 +330,24 @@ fn own_dependencies(package: &str) -> Vec<String> {
 #[test]
 fn a_layer_knows_only_what_stands_below_it() {
     // What each may know of the house, all below it.
-    let ground = ["units", "table", "parallel", "numeric"];
+    let ground = ["table", "numeric"];
     let layers: &[(&str, &[&str])] = &[
-        ("units", &[]),
         ("numeric", &[]),
         ("link", &[]),
         ("board", &["link"]),
-        ("plant", &["units"]),
-        ("vision", &["units"]),
+        ("plant", &[]),
+        ("vision", &[]),
         ("report", &[]),
-        ("table", &["units"]),
-        ("control", &["units", "plant"]),
-        ("rig", &["units", "vision", "plant"]),
-        ("runtime", &["units", "plant", "control", "vision", "rig"]),
-        (
-            "script",
-            &["units", "plant", "control", "rig", "runtime", "table"],
-        ),
-        ("record", &["units", "rig", "control", "runtime", "table"]),
-        ("drivers", &["units", "plant", "vision", "link", "rig"]),
+        ("table", &[]),
+        ("control", &["plant"]),
+        ("rig", &["vision", "plant"]),
+        ("runtime", &["plant", "control", "vision", "rig"]),
+        ("script", &["plant", "control", "rig", "runtime", "table"]),
+        ("record", &["rig", "control", "runtime", "table"]),
+        ("drivers", &["plant", "vision", "link", "rig"]),
         (
             "emulator",
-            &[
-                "units", "plant", "vision", "link", "board", "rig", "drivers",
-            ],
+            &["plant", "vision", "link", "board", "rig", "drivers"],
         ),
         ("ident", &["plant"]),
         ("reconcile", &["plant", "report"]),
@@ -390,7 +384,7 @@ fn a_layer_knows_only_what_stands_below_it() {
         .filter(|path| path.starts_with("crates") && !path.ends_with("cellpos"))
         .filter(|path| {
             let name = path.file_name().unwrap().to_str().unwrap();
-            !known.contains(name) && !["parallel"].contains(&name)
+            !known.contains(name)
         })
         .collect();
     assert!(forgotten.is_empty(), "without a layer: {forgotten:?}");

@@ -26,8 +26,8 @@ pub(super) struct Columns {
     #[arg(long)]
     time_column: Option<String>,
     /// Sampling rate (200Hz) of files without a time column.
-    #[arg(long, value_parser = crate::arguments::positive::<cellpos_units::Hertz>)]
-    rate: Option<cellpos_units::Hertz>,
+    #[arg(long, value_parser = crate::arguments::positive::<cellpos_numeric::units::Hertz>)]
+    rate: Option<cellpos_numeric::units::Hertz>,
     /// Factor from the input column to um of the model: 4 for 4 um per volt. Data of another rig need none.
     #[arg(long, default_value_t = 1.0)]
     input_um_per_unit: f64,

@@ -1,8 +1,8 @@
 //! Whether what is to be reached is in view.
 
 use crate::outcome::Failure;
+use cellpos_numeric::units::Micrometers;
 use cellpos_session::Rig;
-use cellpos_units::Micrometers;
 
 /// Target, and the ends of a sine about it, have to be in view.
 pub(super) fn check(

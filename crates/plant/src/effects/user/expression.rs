@@ -240,7 +240,7 @@ impl Builder<'_> {
 
     fn name(&mut self, name: &str) -> Result<(), ExpressionProblem> {
         let Some(at) = self.names.iter().position(|n| *n == name) else {
-            let near = cellpos_units::nearest(name, self.names.iter().copied());
+            let near = cellpos_numeric::units::nearest(name, self.names.iter().copied());
             return Err(ExpressionProblem(format!(
                 "`{name}` is not known here{}: what may stand here is {}",
                 near.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)")),
@@ -257,7 +257,7 @@ impl Builder<'_> {
             return self.name(name);
         }
         let Some((_, f)) = OF_ONE.iter().find(|(n, _)| *n == name) else {
-            let near = cellpos_units::nearest(name, FUNCTIONS.iter().copied());
+            let near = cellpos_numeric::units::nearest(name, FUNCTIONS.iter().copied());
             return Err(ExpressionProblem(format!(
                 "there is no function `{name}`{}: there are {}",
                 near.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)")),

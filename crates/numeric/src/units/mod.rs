@@ -5,17 +5,12 @@
 //! the loop: inside a step function plain `f64` with the unit in the name (`error_um`) is used.
 //!
 //! ```
-//! use cellpos_units::{Micrometers, Seconds};
+//! use cellpos_numeric::units::{Micrometers, Seconds};
 //! assert_eq!("-250nm".parse(), Ok(Micrometers(-0.25)));
 //! assert_eq!("1.5ms".parse(), Ok(Seconds(0.0015)));
 //! let error = "10".parse::<Micrometers>().unwrap_err();
 //! assert_eq!(error.to_string(), "a length needs a unit: write for example 10um (nm, um, mm, m)");
 //! ```
-#![no_std]
-#![forbid(unsafe_code)]
-
-#[cfg(test)]
-extern crate std;
 
 mod parse;
 mod spelling;
@@ -44,7 +39,6 @@ macro_rules! quantity {
     ($(#[$doc:meta])* $name:ident, $noun:literal, $base:literal, [$($symbol:literal = $factor:expr),+ $(,)?], $symbols:literal) => {
         $(#[$doc])*
         #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
-        #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(transparent))]
         pub struct $name(pub f64);
 
         impl $name {

@@ -3,18 +3,16 @@
 //! Not for a loop: threads are started and joined, and results wait for a lock.
 //!
 //! ```
-//! let squares = cellpos_parallel::map(&[1, 2, 3], 2, |n| n * n);
+//! let squares = cellpos_numeric::parallel::map(&[1, 2, 3], 2, |n| n * n);
 //! assert_eq!(squares, [1, 4, 9], "in the order of the items, whatever thread was first");
 //! ```
-#![forbid(unsafe_code)]
-
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 /// Applies `of` to every item on `threads` threads (at least one, at most one per item); results in the order of the items.
 ///
 /// ```
-/// assert_eq!(cellpos_parallel::map(&[1, 2, 3], 2, |i| i * i), [1, 4, 9]);
+/// assert_eq!(cellpos_numeric::parallel::map(&[1, 2, 3], 2, |i| i * i), [1, 4, 9]);
 /// ```
 ///
 /// # Panics

@@ -1,6 +1,6 @@
 //! The one parser behind every quantity.
 
-use crate::Quantity;
+use crate::units::Quantity;
 use core::fmt;
 
 /// What is wrong with a text that should have been a quantity.
@@ -178,7 +178,9 @@ fn rounded_reciprocal(factor: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use crate::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Seconds, UnitProblem, Volts};
+    use crate::units::{
+        Degrees, Hertz, Micrometers, MicrometersPerSecond, Seconds, UnitProblem, Volts,
+    };
     use std::format;
     use std::string::ToString;
 
