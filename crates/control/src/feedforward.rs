@@ -4,7 +4,6 @@
 //! next reference. (The biproper form of Eq. (6) has a zero at z = -19.3 and must never be inverted.)
 
 use crate::deviation::{DEVIATION, Deviation};
-use crate::law::LawInput;
 use crate::limits::Limits;
 use crate::loop_model::{LoopModel, MODES};
 
@@ -49,8 +48,7 @@ impl Reach {
     }
 
     /// The same from neutral, in the units of the gain in force.
-    pub(crate) fn about_neutral(&self, input: &LawInput) -> Self {
-        let (neutral_um, gain) = (input.estimate.neutral_um, input.tuning.gain);
+    pub(crate) fn about_neutral(&self, neutral_um: f64, gain: f64) -> Self {
         Self {
             low_um: self.low_um * gain - neutral_um,
             high_um: self.high_um * gain - neutral_um,

@@ -71,7 +71,9 @@ impl Path {
 
     /// The command of this tick that moves the model along the path, um from neutral: the law's input gets it.
     fn step(&self, state: &mut PathState, input: &LawInput) -> f64 {
-        let reach = self.reach.about_neutral(input);
+        let reach = self
+            .reach
+            .about_neutral(input.estimate.neutral_um, input.tuning.gain);
         let before = state.on;
         let next_um = |ahead| input.preview(ahead);
         let command_um = self.forward.within(&before, next_um, &reach);

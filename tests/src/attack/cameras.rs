@@ -66,11 +66,15 @@ fn rows(csv: &str) -> Option<Vec<Row>> {
     lines
         .map(|line| {
             let fields: Vec<&str> = line.split(',').collect();
-            let number = |at: usize| fields.get(at)?.parse::<f64>().ok();
+            // An empty field is a number that there is not.
+            let number = |at: usize| match *fields.get(at)? {
+                "" => Some(f64::NAN),
+                text => text.parse::<f64>().ok(),
+            };
             Some(Row {
                 time_s: number(time)?,
                 off_um: number(truth)? - number(target)?,
-                running: number(life)? == 2.0,
+                running: *fields.get(life)? == "running",
             })
         })
         .collect()

@@ -1,6 +1,7 @@
 //! `cellpos check`, `run`, `report` and `bundle` as a user runs them.
 
 use crate::script_runs::*;
+use cellpos_plant::effects;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -327,16 +328,12 @@ fn a_report_shows_the_run_and_a_bundle_is_what_its_manifest_says() {
 #[test]
 fn a_script_stops_when_the_amplitude_is_not_reached() {
     let folder = tempfile::tempdir().unwrap();
-    // At 120 Hz feedback alone does not follow.
+    // The amplifier has a lag of 80 Hz that the model does not know.
     let text = "name = \"far\"\n[stop]\namplitude_error_above = \"40%\"\n[[step]]\ndo = \"sine\"\namplitude = \"2um\"\n\
                 frequency = \"120Hz\"\ncycles = 2000\n";
     std::fs::write(folder.path().join("far.toml"), text).unwrap();
-    let (code, out, err) = cellpos(
-        folder.path(),
-        &["run", "far.toml", "--dry", "--controller", "pi", "--json"],
-    );
+    let (code, run, err) = run_beside(folder.path(), "far.toml", effects::driver_lag(80.0));
     assert_eq!(code, Some(1), "{err}");
-    let run: Value = serde_json::from_str(&out).unwrap();
     assert_eq!(
         (&run["outcome"], &run["stage"]),
         (

@@ -204,7 +204,9 @@ impl MpcLaw {
 
     /// Feed-forward along the preview, kept within range and slew; the first command is the loop's.
     pub(super) fn reference_plan(&self, input: &LawInput) -> ReferencePlan {
-        let reach = self.reach.about_neutral(input);
+        let reach = self
+            .reach
+            .about_neutral(input.estimate.neutral_um, input.tuning.gain);
         let mut on = input.on_path;
         let mut plan = ReferencePlan {
             command: [0.0; HORIZON],
@@ -232,7 +234,9 @@ impl MpcLaw {
         s: &[f64; DEVIATION],
         reference: &ReferencePlan,
     ) -> QpVectors {
-        let reach = self.reach.about_neutral(input);
+        let reach = self
+            .reach
+            .about_neutral(input.estimate.neutral_um, input.tuning.gain);
         let neutral = input.estimate.neutral_um;
         let mut v = QpVectors {
             linear: [0.0; VARS],

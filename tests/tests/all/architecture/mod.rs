@@ -250,7 +250,7 @@ fn every_library_has_a_front_page_with_an_example_that_runs() {
         );
         pages += 1;
     }
-    assert!(pages > 20, "only {pages} libraries");
+    assert!(pages >= 20, "only {pages} libraries");
 }
 
 /// What a test that lacks something prints before it returns green; broken in two, so that this file has no such line.

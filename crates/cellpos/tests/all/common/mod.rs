@@ -1,6 +1,7 @@
 //! Running the program as a user does.
 #![allow(dead_code, reason = "each test file uses what it needs")]
 
+use cellpos_plant::{Effect, Model};
 use serde_json::Value;
 use std::path::Path;
 use std::process::Command;
@@ -50,4 +51,13 @@ pub(crate) fn number(value: &Value, key: &str) -> f64 {
     value[key]
         .as_f64()
         .unwrap_or_else(|| panic!("{key} is no number in {value}"))
+}
+
+/// Writes a model file: the paper's plant with an effect that nobody is told of.
+pub(crate) fn hide(folder: &Path, name: &str, effect: Effect) {
+    let model = Model {
+        working_point_um: 20.0,
+        ..Model::eq6().with_effect(effect)
+    };
+    std::fs::write(folder.join(name), model.to_toml_string()).unwrap();
 }

@@ -1,6 +1,8 @@
 //! Running scripts with the program as a user does, and reading what they leave.
 #![allow(dead_code, reason = "each test file uses what it needs")]
 
+use crate::common::hide;
+use cellpos_plant::Effect;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -83,4 +85,22 @@ pub(crate) fn script(folder: &Path, cycles: u32) {
          [[step]]\ndo = \"hold\"\nduration = \"100ms\"\n"
     );
     std::fs::write(folder.join("quick.toml"), text).unwrap();
+}
+
+/// Runs a script with PI on an emulated rig whose plant hides an effect.
+pub(crate) fn run_beside(
+    folder: &Path,
+    script: &str,
+    effect: Effect,
+) -> (Option<i32>, Value, String) {
+    hide(folder, "other.toml", effect);
+    std::fs::write(
+        folder.join("rig.toml"),
+        "[emulator]\nmodel = \"other.toml\"\n",
+    )
+    .unwrap();
+    let line =
+        format!("run {script} --rig rig.toml --controller pi --clock virtual --frames off --json");
+    let (code, out, err) = cellpos(folder, &line.split(' ').collect::<Vec<_>>());
+    (code, serde_json::from_str(&out).unwrap_or_default(), err)
 }

@@ -84,7 +84,8 @@ pub(crate) fn run_script(
         })
         .unwrap();
     let gains = Pi::new(0.46, 19.5);
-    let file = ControllerFile::from_pi(gains, 2.5e-3);
+    let mut file = ControllerFile::from_pi(gains, 2.5e-3);
+    file.limits.slew_um_per_s = 20_000.0;
     let plant = DesignPlant::from_model(&model, Some(2.5e-3), 1e-3).unwrap();
     let core = Core::new(
         file.loop_config(&model).unwrap(),
