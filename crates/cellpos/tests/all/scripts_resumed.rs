@@ -13,7 +13,7 @@ fn learning_takes_the_error_of_a_script_down_and_is_gone_on_from_after_a_cut() {
     // behind both.
     let text = "name = \"turns\"\nlearn = true\n[stop]\nafter_cycles = 104\n[[step]]\ndo = \"repeat\"\ntimes = 4\n\
                 [[step.step]]\ndo = \"sine\"\namplitude = \"2um\"\nfrequency = \"20Hz\"\ncycles = 30\nramp_in = 2\nramp_out = 2\n\
-                [[step.step]]\ndo = \"triangle\"\namplitude = \"1um\"\nfrequency = \"10Hz\"\ncycles = 20\n\
+                [[step.step]]\ndo = \"triangle\"\namplitude = \"4um\"\nfrequency = \"10Hz\"\ncycles = 20\n\
                 [[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"5Hz\"\ncycles = 4\n";
     std::fs::write(at.join("turns.toml"), text).unwrap();
     let (code, run, err) = run_beside(at, "turns.toml", effects::leak(80.0));
@@ -40,7 +40,7 @@ fn learning_takes_the_error_of_a_script_down_and_is_gone_on_from_after_a_cut() {
     let replay = json(at, &["replay", folder.to_str().unwrap(), "--json"]);
     assert_eq!(replay["ticks"], replay["identical"], "{replay}");
     let kept = std::fs::read_to_string(folder.join("learned.toml")).unwrap();
-    assert!(kept.contains("sine of 2 um at 20 Hz") && kept.contains("triangle of 1 um at 10 Hz"));
+    assert!(kept.contains("sine of 2 um at 20 Hz") && kept.contains("triangle of 4 um at 10 Hz"));
 
     // The end of the run is cut off, as by a crash.
     let meta = std::fs::read_to_string(folder.join("run.toml")).unwrap();
