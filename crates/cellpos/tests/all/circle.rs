@@ -4,7 +4,6 @@ use crate::common;
 use crate::common::{hide, number, succeed};
 use cellpos_plant::{Model, Noise, effects};
 use serde_json::Value;
-use std::path::Path;
 
 fn named<'a>(result: &'a Value, id: &str) -> &'a Value {
     let effects = result["effects"].as_array().unwrap();
