@@ -140,63 +140,43 @@ impl Motion<'_> {
         .map_err(Failure::input)
     }
 
-    /// Warning about a loop with a predicted error above a tenth of this motion's amplitude; `better` gives the same rig
-    /// with another controller.
+    /// Warning about a predicted error above a tenth of this motion's amplitude. Every law follows what the model can do (the loop
+    /// knows the reference in advance), so no other controller is advised.
     ///
     /// # Errors
     /// A model or a controller of which no loop can be made.
-    pub fn warning(
-        &self,
-        prepared: &Prepared,
-        file: &RigFile,
-        better: impl Fn(&'static str) -> Result<Prepared, Failure>,
-    ) -> Result<Option<String>, Failure> {
+    pub fn warning(&self, prepared: &Prepared, file: &RigFile) -> Result<Option<String>, Failure> {
         let figures = self.figures(prepared, file)?;
-        let allowed_um = 0.1 * figures.amplitude_um;
-        if figures.rms_um <= allowed_um {
-            return Ok(None);
-        }
-        let mut advice = "a lower frequency or amplitude, or --learn, brings it down".to_string();
-        for name in ["lead", "lqg", "mpc"] {
-            let um = self.figures(&better(name)?, file)?.rms_um;
-            if um <= allowed_um {
-                advice = format!("--controller {name} is predicted to follow with {um:.3} um RMS");
-                break;
-            }
-        }
-        Ok(Some(format!(
-            "{}: this controller is predicted to miss it by {:.2} um RMS; {advice}",
-            self.name, figures.rms_um
-        )))
+        Ok((figures.rms_um > 0.1 * figures.amplitude_um).then(|| {
+            format!(
+                "{}: predicted to be missed by {:.2} um RMS at and between ticks; a lower frequency or amplitude, or a shorter \
+                 period, brings it down",
+                self.name, figures.rms_um
+            )
+        }))
     }
 }
 
-/// Refuses a sine that the loop cannot follow, and gives what to say of one that it will miss; said already, before anything moves. A
-/// sine that is learned is not missed. `better` gives the same rig with another controller.
+/// Refuses a sine that the loop cannot follow, and gives what to say of one that it will miss; said already, before anything moves.
 ///
 /// # Errors
 /// See [`Sine::check`].
 pub fn predicted(
     sine: Option<Sine>,
-    learns: bool,
     prepared: &Prepared,
     file: &RigFile,
-    better: impl Fn(&'static str) -> Result<Prepared, Failure>,
 ) -> Result<Option<String>, Failure> {
     let Some(sine) = sine else {
         return Ok(None);
     };
     sine.check(prepared, file)?;
-    if learns {
-        return Ok(None);
-    }
     let motion = Motion {
         name: format!("{}@{}", sine.amplitude, sine.frequency),
         reference: &sine.profile(),
         from_s: FADE_S,
         frequency_hz: sine.frequency.value(),
     };
-    let warning = motion.warning(prepared, file, better)?;
+    let warning = motion.warning(prepared, file)?;
     if let Some(warning) = &warning {
         tracing::warn!("{warning}");
     }

@@ -153,8 +153,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let mut rig = checked::open(file, options, args.rig.as_deref(), args.anyway)?;
     rig.fit(&mut prepared);
     target::check(args.target, args.sine.map(|sine| sine.amplitude), &rig)?;
-    let better = |name: &'static str| rig.prepare(&args.model, name);
-    let predicted = cyclic::predicted(args.sine, args.learn, &prepared, rig.file(), better)?;
+    let predicted = cyclic::predicted(args.sine, &prepared, rig.file())?;
     let limits = prepared.controller.limits;
     let learn = learn(&args, &prepared, rig.file())?;
     let mut setup = rig.set_up(prepared, reference(&args))?;

@@ -37,7 +37,7 @@ pub fn step_response(
     config: &LoopConfig,
     size_um: f64,
 ) -> Result<Vec<f64>, SetUpError> {
-    noise_free(plant, config, 2000, 0.0, |_| size_um).map(|(positions, _)| positions)
+    noise_free(plant, config, 2000, 0.0, |_| size_um).map(|run| run.position_um)
 }
 
 impl DesignReport {

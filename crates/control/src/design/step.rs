@@ -6,7 +6,7 @@ use crate::error::BuildError;
 use crate::loop_io::LoopInput;
 use crate::reference::Reference;
 use crate::simulation::{RigConfig, SimulatedRig};
-use cellpos_plant::PlantError;
+use cellpos_plant::{DiscretePlant, PlantError, Seconds};
 use thiserror::Error;
 
 /// Why a simulation cannot be set up.
@@ -64,21 +64,37 @@ fn rig(plant: &DesignPlant) -> Result<SimulatedRig, PlantError> {
     })
 }
 
-/// True positions of a noise-free run: `reference(k)` at each tick, a drift from `SETTLE_TICKS` on.
+/// A noise-free run.
+pub(crate) struct NoiseFree {
+    /// True position at each tick, um.
+    pub(crate) position_um: Vec<f64>,
+    /// The same half a tick before, um: a command that is held moves the bead between ticks as it likes.
+    half_before_um: Vec<f64>,
+    /// Largest command change per tick, um.
+    largest_move_um: f64,
+}
+
+/// Follows `reference(k)` at each tick, with a drift from `SETTLE_TICKS` on.
 pub(crate) fn noise_free(
     plant: &DesignPlant,
     config: &LoopConfig,
     ticks: usize,
     drift_um_per_s: f64,
     reference: impl Fn(usize) -> f64,
-) -> Result<(Vec<f64>, f64), SetUpError> {
+) -> Result<NoiseFree, SetUpError> {
     let mut controller = Controller::new(*config)?;
     let mut rig = rig(plant)?;
+    let ts = plant.sample_time_s;
+    let between = DiscretePlant::new(&plant.plant, Seconds(ts), Seconds(0.5 * ts))?;
+    let mut between_state = between.state(0.0);
     controller.start(plant.neutral_um, plant.neutral_um);
     let mut preview = vec![0.0; controller.preview_len()];
     let mut last = controller.previous_command_um();
-    let mut largest: f64 = 0.0;
-    let mut positions = Vec::with_capacity(ticks);
+    let mut run = NoiseFree {
+        position_um: Vec::with_capacity(ticks),
+        half_before_um: Vec::with_capacity(ticks),
+        largest_move_um: 0.0,
+    };
     for k in 0..SETTLE_TICKS + ticks {
         if k == SETTLE_TICKS {
             rig.drift_um_per_s = drift_um_per_s;
@@ -90,7 +106,10 @@ pub(crate) fn noise_free(
             *slot = at(tick + ahead + 1);
         }
         if active {
-            positions.push(rig.true_um());
+            run.position_um.push(rig.true_um());
+            let drifted_um = drift_um_per_s * ts * (tick as f64 - 0.5).max(0.0);
+            run.half_before_um
+                .push(between.output_um(&between_state) + drifted_um);
         }
         let input = LoopInput {
             measurement: Some(rig.measure()),
@@ -100,12 +119,13 @@ pub(crate) fn noise_free(
         };
         let out = controller.step(&input);
         if active {
-            largest = largest.max((out.command_um - last).abs());
+            run.largest_move_um = run.largest_move_um.max((out.command_um - last).abs());
         }
         last = out.command_um;
         rig.advance(out.command_um);
+        between.step(&mut between_state, out.command_um - plant.neutral_um);
     }
-    Ok((positions, largest))
+    Ok(run)
 }
 
 fn settled_after(errors: impl Iterator<Item = f64>, band: f64, sample_time_s: f64) -> f64 {
@@ -132,8 +152,8 @@ pub fn step_figures(
     config: &LoopConfig,
     size_um: f64,
 ) -> Result<StepFigures, SetUpError> {
-    let (y, largest_move_um) = noise_free(plant, config, 2000, 0.0, |_| size_um)?;
-    let ts = plant.sample_time_s;
+    let run = noise_free(plant, config, 2000, 0.0, |_| size_um)?;
+    let (y, ts) = (run.position_um, plant.sample_time_s);
     let first = |level: f64| {
         y.iter()
             .position(|&p| p / size_um >= level)
@@ -151,7 +171,7 @@ pub fn step_figures(
         overshoot_percent: 100.0 * (highest - 1.0).max(0.0),
         settling_5_percent_s: settled(0.05),
         settling_2_percent_s: settled(0.02),
-        largest_move_um,
+        largest_move_um: run.largest_move_um,
     })
 }
 
@@ -166,7 +186,7 @@ pub struct CycleFigures {
     pub largest_move_um: f64,
 }
 
-/// Error along a periodic reference, noise-free, through the loop's limits. After `from_s` the reference is in full swing for a
+/// Error along a periodic reference at and between ticks, noise-free, through the loop's limits. After `from_s` the reference is in full swing for a
 /// second or three periods before the error of a second or three periods more is taken.
 ///
 /// # Errors
@@ -183,21 +203,28 @@ pub fn cycle_figures(
     let ts = plant.sample_time_s;
     let span_s = (3.0 / frequency_hz).clamp(1.0, LONGEST_S);
     let ticks = |s: f64| (s / ts).round() as usize;
-    let wish_um = |k: usize| reference.at_um(k as f64 * ts);
+    let wish_um = |k: f64| reference.at_um(k * ts);
     let all = ticks(from_s + 2.0 * span_s);
-    let (y, largest_move_um) = noise_free(plant, config, all, 0.0, wish_um)?;
-    let from = ticks(from_s + span_s);
-    let squares = y.iter().enumerate().skip(from);
-    let squares = squares.map(|(k, um)| (um - wish_um(k)).powi(2));
-    let (low_um, high_um) = (from..all)
-        .map(wish_um)
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), um| {
-            (low.min(um), high.max(um))
-        });
+    let run = noise_free(plant, config, all, 0.0, |k| wish_um(k as f64))?;
+    let from = ticks(from_s + span_s).max(1);
+    let (mut low_um, mut high_um, mut squares) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
+    for k in from..all {
+        let off_um = |tick: usize| run.position_um[tick] - wish_um(tick as f64);
+        let (begin, end) = (off_um(k - 1), off_um(k));
+        let middle = run.half_before_um[k] - wish_um(k as f64 - 0.5);
+        // Mean square of the parabola through the three.
+        squares += (4.0 * (begin * begin + end * end + 4.0 * middle * middle)
+            + 4.0 * middle * (begin + end)
+            - 2.0 * begin * end)
+            / 30.0;
+        for um in [wish_um(k as f64), wish_um(k as f64 - 0.5)] {
+            (low_um, high_um) = (low_um.min(um), high_um.max(um));
+        }
+    }
     Ok(CycleFigures {
         amplitude_um: 0.5 * (high_um - low_um).max(0.0),
-        rms_um: (squares.sum::<f64>() / (all - from).max(1) as f64).sqrt(),
-        largest_move_um,
+        rms_um: (squares / (all - from).max(1) as f64).sqrt(),
+        largest_move_um: run.largest_move_um,
     })
 }
 
@@ -210,7 +237,7 @@ pub fn disturbance_figures(
     config: &LoopConfig,
     drift_um_per_s: f64,
 ) -> Result<DisturbanceFigures, SetUpError> {
-    let (y, _) = noise_free(plant, config, 4000, drift_um_per_s, |_| 0.0)?;
+    let y = noise_free(plant, config, 4000, drift_um_per_s, |_| 0.0)?.position_um;
     let peak_um = y.iter().fold(0.0_f64, |m, p| m.max(p.abs()));
     Ok(DisturbanceFigures {
         drift_um_per_s,

@@ -1,7 +1,8 @@
 //! The PI loop on the simulated rig: hold, step, drift, spread, lost and stuck beads.
 
 use cellpos_control::design::{
-    DesignPlant, bound_rms_um, default_lead, disturbance_figures, noise_figures, step_figures,
+    DesignPlant, bound_rms_um, cycle_figures, default_lead, disturbance_figures, noise_figures,
+    step_figures,
 };
 use cellpos_control::*;
 
@@ -107,6 +108,45 @@ fn a_10_um_step_settles_to_5_percent_within_60_ms_with_less_than_15_percent_over
         let f = step_figures(&plant, &published(), size_um).unwrap();
         assert!(f.settling_5_percent_s < 0.060, "{f:?}");
         assert!(f.overshoot_percent < 15.0, "{f:?}");
+    }
+}
+
+/// A held command moves an integrator along the chords of the reference: at the ticks nothing is missed, between them much.
+#[test]
+fn the_predicted_error_of_a_sine_is_that_between_ticks() {
+    let plant = DesignPlant {
+        plant: cellpos_plant::TransferFunction::integrator(428.0).unwrap(),
+        ..DesignPlant::eq6(2.5e-3)
+    };
+    let config = LoopConfig {
+        model: plant.loop_model().unwrap(),
+        ..published()
+    };
+    for frequency_hz in [20.0, 100.0, 250.0, 400.0] {
+        let sine = Profile::Wave {
+            shape: Shape::Sine,
+            centre_um: 0.0,
+            amplitude_um: 0.1,
+            frequency_hz,
+            fade_s: 0.2,
+        };
+        let f = cycle_figures(&plant, &config, &sine, 0.2, frequency_hz).unwrap();
+        let w = std::f64::consts::TAU * frequency_hz * 1e-3;
+        let square = |phase: f64, s: f64| {
+            let chord = (1.0 - s) * phase.sin() + s * (phase + w).sin();
+            ((phase + w * s).sin() - chord).powi(2)
+        };
+        let grid = |n: usize| (0..n).map(move |i| (i as f64 + 0.5) / n as f64);
+        let mean = grid(64)
+            .flat_map(|a| grid(64).map(move |s| square(std::f64::consts::TAU * a, s)))
+            .sum::<f64>()
+            / 4096.0;
+        let chords_um = 0.1 * mean.sqrt();
+        assert!(
+            (f.rms_um - chords_um).abs() < 0.05 * chords_um,
+            "{frequency_hz} Hz: {} um for {chords_um}",
+            f.rms_um
+        );
     }
 }
 

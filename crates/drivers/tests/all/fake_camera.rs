@@ -120,6 +120,8 @@ static MADE_NS: Mutex<Vec<i64>> = Mutex::new(vec![]);
 /// Longest that a time stamp may be off, ns. A picture is stamped just before it is drawn, to the microsecond; a tenth of a
 /// millisecond is what a delay may be off without a word.
 const STAMP_OFF_NS: i64 = 100_000;
+/// The clocks of a camera and of a computer run apart by less than this.
+const CLOCKS_APART: f64 = 200e-6;
 
 /// Where the bead is drawn in picture `n`, px: slow circles, 300 px/s at most.
 fn place(n: u32) -> (f64, f64) {
@@ -249,19 +251,30 @@ fn number(buffer: &FrameBuffer) -> u32 {
     u32::from_be_bytes(bytes.unwrap())
 }
 
-/// Judges the time stamps by when the pictures were made, however late they came: [`LATENCY_MS`] is told to be the time from the
-/// middle of the exposure to the fastest arrival, so a stamp is the picture's time, plus the fastest way, minus that.
+/// Judges the time stamps by when the pictures were made, however late they came. [`LATENCY_MS`] is told to be the time from the middle of
+/// the exposure to the fastest arrival. What the machine let the driver know of the fastest way is the least that it saw, aged by
+/// [`CLOCKS_APART`]; a stamp is the picture's time, plus that, minus the latency. So a slow machine makes no stamp wrong.
 fn judge(stamps: &[(u32, FrameStamp)]) {
     let made_ns = MADE_NS.lock().unwrap();
     let made = |n: u32| made_ns[n as usize];
     let ways = stamps.iter().map(|&(n, s)| s.arrival_ns - made(n));
-    let (fastest_ns, slowest_ns) = (ways.clone().min().unwrap(), ways.max().unwrap());
-    let expected_ns = fastest_ns - (LATENCY_MS * 1e6) as i64;
+    let (fastest_ns, slowest_ns) = (ways.clone().min().unwrap(), ways.clone().max().unwrap());
+    let mut known: Option<(f64, i64)> = None;
+    let known_ns: Vec<i64> = ways
+        .zip(stamps)
+        .map(|(way_ns, &(_, s))| {
+            let aged = known.map_or(f64::INFINITY, |(least, at_ns)| {
+                least + CLOCKS_APART * (s.arrival_ns - at_ns) as f64
+            });
+            let least = aged.min(way_ns as f64);
+            known = Some((least, s.arrival_ns));
+            least as i64
+        })
+        .collect();
     // The first half second at most teaches the offset of the two clocks.
     let settled = (stamps.len() / 2).min(500);
-    let mut off_ns: Vec<i64> = stamps[settled..]
-        .iter()
-        .map(|&(n, s)| s.mid_exposure_ns - made(n) - expected_ns)
+    let mut off_ns: Vec<i64> = (stamps.iter().zip(known_ns).skip(settled))
+        .map(|(&(n, s), way_ns)| s.mid_exposure_ns - made(n) - way_ns + (LATENCY_MS * 1e6) as i64)
         .collect();
     off_ns.sort_unstable();
     let at = |share: f64| off_ns[((off_ns.len() - 1) as f64 * share) as usize];

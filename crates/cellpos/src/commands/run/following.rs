@@ -3,10 +3,10 @@
 use crate::cyclic::Motion;
 use crate::outcome::Failure;
 use cellpos_script::{Check, PeriodicReference, Plan, Script};
-use cellpos_session::setup::{self, Prepared};
+use cellpos_session::setup::Prepared;
 use cellpos_session::{Rig, RigFile};
 
-/// Most motions whose error is predicted: each takes a simulation for each controller that could do better.
+/// Most motions whose error is predicted: each takes a simulation.
 const MOST_MOTIONS: usize = 16;
 
 /// Refuses a wave above half the loop's rate.
@@ -43,13 +43,6 @@ pub(super) fn warnings(
     prepared: &Prepared,
     rig: &Rig,
 ) -> Result<Vec<String>, Failure> {
-    let better = |name: &'static str| {
-        let model = prepared.model.clone();
-        let controller = setup::controller(name, &model, &rig.file().timing)?;
-        let mut other = Prepared { model, controller };
-        rig.fit(&mut other);
-        Ok(other)
-    };
     let mut warnings = Vec::new();
     for (number, motion) in plan.periodic().iter().enumerate().take(MOST_MOTIONS) {
         let Some(reference) = plan.periodic_reference(number) else {
@@ -61,7 +54,7 @@ pub(super) fn warnings(
             from_s: PeriodicReference::FADE_S,
             frequency_hz: motion.frequency_hz,
         };
-        warnings.extend(motion.warning(prepared, rig.file(), better)?);
+        warnings.extend(motion.warning(prepared, rig.file())?);
     }
     for warning in &warnings {
         tracing::warn!("{warning}");
