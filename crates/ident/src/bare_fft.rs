@@ -1,7 +1,7 @@
 //! The paper's Appendix B: gain and phase read from a bare FFT. Offered by name, to show what drift does to it.
 //!
-//! No window, no drift taken off: a steady drift `v` adds `v/(pi f)` to every bin, however long the record. At 10 Hz,
-//! 10 um/s of drift turn -93.3 deg into about -96 deg. For results use [`crate::frequency_response`].
+//! It uses no window and removes no drift: a steady drift `v` adds `v/(pi f)` to every bin, however long the record. At
+//! 10 Hz, 10 um/s of drift turn -93.3 deg into about -96 deg. For results use [`crate::frequency_response`].
 
 use nalgebra::Complex;
 use realfft::RealFftPlanner;

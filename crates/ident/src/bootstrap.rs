@@ -6,10 +6,10 @@ use nalgebra::Complex;
 
 /// Parameter vectors of the chosen order fitted to resampled blocks, each with a new draw of the weak bounds on the feedthrough.
 ///
-/// A fit held by a bound that is right on average errs by less than its covariance says where the bound acts, and by how
-/// much less depends on where it landed: replicates about that place alone would repeat its luck. With the bound drawn as a datum
-/// like the lines, their spread is that of the covariance (randomise, then optimise), and the shape that of the
-/// fit as it is, not of its linear part.
+/// A weak bound pulls the fit, so where it acts the fit errs by less than the covariance says. How much less depends on where
+/// this fit ended, and replicates around that point would repeat the accident. Each replicate therefore draws the bound as a
+/// datum, like the lines (randomise, then optimise): the spread is that of the covariance, and the shape that of the full fit,
+/// not of its linear part.
 pub fn bootstrap(
     problem: &OrderSelection<'_>,
     fit: &CandidateFits,
@@ -29,8 +29,8 @@ pub fn bootstrap(
                         return p.response;
                     }
                     let sum: Complex<f64> = (0..n).map(|_| p.block_errors[random.below(n)]).sum();
-                    // Resampled means are narrower than the truth by (n-1)/n; the noise model sets the size, and
-                    // the misfit of the order widens it as it widens the covariance.
+                    // The variance of resampled means is too small by (n-1)/n. The noise model sets the size; a misfit of the
+                    // order widens it as it widens the covariance.
                     let size = (p.variance / p.scatter_variance.max(f64::MIN_POSITIVE) * n as f64
                         / (n as f64 - 1.0)
                         * fit.scale)

@@ -1,9 +1,9 @@
 //! The candidate models as functions of physical parameters, from a bare integrator to Eq. (4).
 //!
-//! `G(s) = K (1 + s/z) (1 + s tau) / ((s + q) (1 + s/p)) e^(-s L)`: integrator gain `K`, pole-zero pair `z`, `p`, far
-//! zero at `-1/tau`, slow pole at `-q`, delay `L`. With all of them this is Eq. (4) with real poles and zeros
-//! (`alpha = K tau p/z`); without the far zero and with `q = 0` a pole-zero pair on an integrator; with `z = p` a bare
-//! integrator. A second lag `1/(1 + s/r)` stands in the place of far zero and slow pole. Eq. (5) read rightly is `K = 2 pi 63 /s`. Not for resonances: see [`crate::rational`].
+//! `G(s) = K (1 + s/z) (1 + s tau) / ((s + q) (1 + s/p)) e^(-s L)`: integrator gain `K`, pole-zero pair `z`, `p`, far zero at `-1/tau`,
+//! slow pole at `-q`, delay `L`. With all parameters this is Eq. (4) with real poles and zeros (`alpha = K tau p/z`). Without the far
+//! zero and with `q = 0` it is an integrator with a pole-zero pair; with `z = p` also, a bare integrator. A second lag `1/(1 + s/r)` can
+//! replace far zero and slow pole. Eq. (5), read correctly, is `K = 2 pi 63 /s`. Not for resonances: see [`crate::rational`].
 
 use nalgebra::Complex;
 
@@ -26,14 +26,14 @@ pub struct CandidateModel {
     pub slow_pole_rad_per_s: f64,
     /// Delay from the command to the middle of the exposure, s.
     pub delay_s: f64,
-    /// Which part of the feedthrough a record shows one row later than the rest. `None`: the effect of the exposure and of an
-    /// output that steps at once. It hangs on where within the exposure the output really steps, a matter of
-    /// microseconds that no band below half the sampling rate tells; a fit therefore leaves it free.
+    /// Part of the feedthrough that a record shows one row later than the rest. `None`: as the exposure and an immediate step of the
+    /// output give it. It depends on when within the exposure the output really steps. No band below half the sampling rate shows those
+    /// microseconds, so a fit leaves this parameter free.
     pub feedthrough_share: Option<f64>,
 }
 
 impl CandidateModel {
-    /// A bare integrator behind a delay: Eq. (5) with its unit put right.
+    /// A bare integrator behind a delay: Eq. (5) with the correct unit.
     pub fn integrator(gain_per_s: f64, delay_s: f64) -> Self {
         Self {
             gain_per_s,
@@ -69,8 +69,8 @@ impl CandidateModel {
         }
     }
 
-    /// Delay less the lead of the far zero, s. Behind a zero-order hold the two trade exactly for an integrator, so
-    /// that this difference is what the phase of a record determines.
+    /// Delay less the lead of the far zero, s. For an integrator behind a zero-order hold, delay and lead trade exactly, so the phase of
+    /// a record determines only this difference.
     pub fn effective_delay_s(&self) -> f64 {
         self.delay_s - self.far_lead_s
     }
@@ -113,7 +113,7 @@ impl CandidateModel {
         ((z / p - 1.0).abs() >= 1e-12).then_some((z, p))
     }
 
-    /// The pair's zero, where there is one: a lead of less than a nanosecond is none.
+    /// The pair's zero, if there is one: a lead below a nanosecond does not count.
     fn zero(&self) -> Option<f64> {
         self.pair().map(|(z, _)| z).filter(|z| *z < 1e9)
     }
@@ -122,7 +122,7 @@ impl CandidateModel {
     fn poles(&self) -> Vec<f64> {
         let pole = self.pair().map(|(_, p)| p);
         let second = self.second_pole_rad_per_s.map(|r| match pole {
-            // Two equal lags are not the sum of two fractions; a part in ten thousand does not show.
+            // Two equal lags have no partial fractions, so they are moved apart by 1e-4, which no record shows.
             Some(p) if (r / p - 1.0).abs() < 1e-4 => p * (1.0 + 1e-4),
             _ => r,
         });

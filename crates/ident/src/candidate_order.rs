@@ -10,7 +10,8 @@ pub enum CandidateOrder {
     Integrator,
     /// With a pole-zero pair.
     PoleZeroPair,
-    /// With two lags in the pair's place: a regulator and a tube that stretches. No far zero: such a plant moves nothing at once.
+    /// With two lags instead of the pair: a regulator and a tube that stretches. No far zero: such a plant never responds at
+    /// once.
     TwoLags,
     /// With two lags and a zero.
     TwoLagsZero,
@@ -42,7 +43,7 @@ impl CandidateOrder {
         }
     }
 
-    /// The order of which this one is a case with more parameters.
+    /// The order that this one extends by parameters.
     pub fn below(self) -> Option<Self> {
         match self {
             CandidateOrder::Integrator => None,
@@ -86,7 +87,7 @@ pub mod index {
     pub const LN_POLE: usize = 3;
     /// `ln` of the second lag's pole in rad/s.
     pub const LN_SECOND_POLE: usize = 2;
-    /// `ln` of the zero beside two lags in rad/s.
+    /// `ln` of the zero in rad/s of the order with two lags.
     pub const LN_ZERO_OF_LAGS: usize = 4;
     /// Lead of the far zero, ms.
     pub const FAR_LEAD_MS: usize = 4;
@@ -103,7 +104,7 @@ pub struct DelayPrior {
     pub delay_s: f64,
     /// Its standard deviation, s.
     pub sd_s: f64,
-    /// Half of its 95 % interval, s: not 1.96 standard deviations where its error is not normal.
+    /// Half of its 95 % interval, s: not 1.96 standard deviations if its error is not normal.
     pub half95_s: f64,
 }
 
@@ -118,16 +119,16 @@ pub struct CandidateFit {
     pub parameters: Vec<f64>,
     /// Covariance of the parameter vector, already multiplied by `scale`.
     pub covariance: DMatrix<f64>,
-    /// Weighted sum of squares (about the degrees of freedom for a right model).
+    /// Weighted sum of squares; for a correct model about the degrees of freedom.
     pub chi2: f64,
     /// Real data less parameters.
     pub dof: f64,
     /// Corrected Akaike criterion, lower is better.
     pub aicc: f64,
-    /// Weighted sum of squares per real datum on blocks that the fit has not seen; about 1 plus the fit's own share
-    /// for a right model.
+    /// Weighted sum of squares per real datum on blocks that the fit has not seen; for a correct model about 1 plus the fit's own
+    /// share.
     pub held_out: f64,
-    /// Probability that the step from the order below is by chance (1 for the lowest).
+    /// Probability that chance explains the improvement over the order below (1 for the lowest).
     pub step_p_value: f64,
     /// Whether the iteration converged.
     pub converged: bool,

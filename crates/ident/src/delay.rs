@@ -1,24 +1,23 @@
 //! The delay from a command to the exposure that shows it, by dithered edges: the LED test of the paper's Fig. 6, below a
 //! millisecond.
 //!
-//! One edge seen through a 1 kHz camera tells the delay to within a frame. An edge that falls into an exposure tells it by the
-//! brightness of that frame to some microseconds, one that falls between two exposures to within the gap. Times are those of the
-//! exposures, by the frames' own time stamps: when a frame arrived, and how long the machine stalled before it was read, does not
-//! enter. The median does the rest: an edge that was sent late by a stall is one edge. Not for the delay of the PZT and the flow:
-//! that is in the phase slope.
+//! Through a 1 kHz camera a single edge gives the delay only to within a frame. If the edge falls into an exposure, the
+//! brightness of that frame gives it to some microseconds; if it falls between two exposures, it is known to within the gap.
+//! Times are those of the exposures, from the frames' own time stamps, so late arrival and stalls of the machine do not matter.
+//! The median discards edges that a stall sent late. Not for the delay of PZT and flow: that is in the phase slope.
 
 use crate::error::IdentError;
 use cellpos_numeric::Random;
 
-/// One edge and its frames. The light changed between two times of the camera, which are equal when the
-/// brightness of a frame tells the time.
+/// One edge and its frames. The light changed between two times of the camera; they are equal if the brightness of a frame gives
+/// the time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeenEdge {
     /// Time at which the light was switched, s.
     pub sent_s: f64,
-    /// The light had not changed yet, s.
+    /// Last time at which the light had not changed, s.
     pub before_s: f64,
-    /// The light had changed, s.
+    /// First time at which the light had changed, s.
     pub after_s: f64,
 }
 
@@ -27,7 +26,7 @@ pub struct SeenEdge {
 pub struct Brightness<'a> {
     /// Middle of the exposure by the frame's time stamp, s; rising.
     pub mid_s: &'a [f64],
-    /// Exposure, s; 0 where the camera does not say: then a frame tells only whether the light was on in its middle.
+    /// Exposure, s; 0 if the camera does not report it: a frame then shows only whether the light was on in its middle.
     pub exposure_s: f64,
     /// Mean grey level.
     pub grey: &'a [f64],
@@ -46,9 +45,9 @@ pub struct DelayEstimate {
     pub edges: usize,
 }
 
-/// Times at which to switch the light: `count` edges, `spacing_s` apart, each dithered over one frame period. The
-/// dither is stratified (one draw in each of `count` equal parts of the period, in random order), which covers the
-/// period more evenly than independent draws.
+/// Times at which to switch the light: `count` edges, `spacing_s` apart, each dithered over one frame period. The dither is
+/// stratified: one draw in each of `count` equal parts of the period, in random order. It covers the period more evenly than
+/// independent draws.
 pub fn dithered_edges(
     count: usize,
     spacing_s: f64,
@@ -72,7 +71,7 @@ pub fn dithered_edges(
         .collect()
 }
 
-/// Finds each edge in a brightness record. `sent_s` are rising or falling edges in turn, starting with rising.
+/// Finds each edge in a brightness record. Edges in `sent_s` alternate, and the first one rises.
 ///
 /// # Errors
 /// [`IdentError::EdgesNotSeen`] when fewer than half the edges show, [`IdentError::Lengths`].
@@ -96,13 +95,13 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
     for (i, &sent) in sent_s.iter().enumerate() {
         let rising = i % 2 == 0;
         let until = sent_s.get(i + 1).copied().unwrap_or(f64::INFINITY);
-        // A frame that was over when the light was switched; stamps may be off by an exposure.
+        // Skip frames that ended before the light was switched; stamps may be off by an exposure.
         let start = mid_s.partition_point(|&t| t < sent - 0.5 * exposure_s - 1e-12);
         let turned = |k: usize| {
             let lit = levels.share(grey[k]);
             if rising { lit } else { 1.0 - lit }
         };
-        // An edge belongs to a switch only if the light was in the other state when it was sent.
+        // An edge belongs to a command only if the light was in the other state when the command was sent.
         if start == 0 || start >= mid_s.len() || turned(start - 1) > 0.5 {
             continue;
         }
@@ -139,7 +138,7 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
 struct Levels {
     dark: f64,
     lit: f64,
-    /// Share of the light that noise may feign.
+    /// Share of the light that noise can imitate.
     doubt: f64,
 }
 
@@ -158,12 +157,12 @@ impl Levels {
                     .copied()
                     .unwrap_or(threshold)
             };
-            // Frames with an edge in them are few: the middle half of the others has its share of the noise's quartiles.
+            // Few frames hold an edge, so the quartiles of all frames of a level measure its noise.
             (at(0.5), 0.74 * (at(0.75) - at(0.25)))
         };
         let ((dark, dark_sd), (lit, lit_sd)) = (side(false), side(true));
         let swing = (lit - dark).max(f64::MIN_POSITIVE);
-        // Five standard deviations: one frame of a million is mistaken. Less than 1 % of an exposure tells nothing more.
+        // Five standard deviations: about one frame in a million is mistaken. A share below 1 % of an exposure adds nothing.
         let doubt = (5.0 * dark_sd.max(lit_sd) / swing).clamp(0.01, 0.45);
         Self { dark, lit, doubt }
     }
@@ -174,14 +173,14 @@ impl Levels {
     }
 }
 
-/// Smallest number of timed edges for an interval of the median by ranks.
+/// Fewest timed edges for an interval of the median by ranks.
 const ENOUGH_TIMES: usize = 12;
 
 /// The delay from edges, as a median: edges delayed by a stall are outvoted.
 ///
-/// Edges whose time is known (they fell into an exposure, whatever their delay, by the dither) have a median with an interval by
-/// its ranks, free of any distribution. With too few, each edge gives `before - sent < L <= after - sent` and the value
-/// in most of these intervals is taken; its interval is by drawing the edges again.
+/// The dither lets a part of the edges fall into an exposure, whatever the delay, and their time is known exactly. Their median
+/// has an interval by ranks, without an assumed distribution. If they are too few, each edge gives `before - sent < L <= after -
+/// sent`, and the estimate is the value that most of these intervals share; its interval comes from resampled edges.
 ///
 /// # Errors
 /// [`IdentError::TooShort`] below four edges.
@@ -210,7 +209,7 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
     let low = spans.iter().map(|s| s[0]).fold(f64::NEG_INFINITY, f64::max);
     let high = spans.iter().map(|s| s[1]).fold(f64::INFINITY, f64::min);
     if low < high {
-        // No edge contradicts another: the delay is anywhere between with equal right, for the dither covers the period evenly.
+        // All intervals overlap. The dither covers the period evenly, so every delay in the overlap is equally likely.
         let (delay_s, width) = (0.5 * (low + high), high - low);
         return Ok(DelayEstimate {
             delay_s,
@@ -246,7 +245,7 @@ fn median(times: &[f64], edges: usize) -> DelayEstimate {
     let at = |rank: f64| times[(rank.max(0.0) as usize).min(times.len() - 1)];
     let half = 0.98 * n.sqrt();
     let delay_s = 0.5 * (at(0.5 * n - 0.5) + at(0.5 * n));
-    // What the brightness of 8 bits resolves, and the camera's own jitter: never surer than some microseconds.
+    // The resolution of 8-bit brightness and the camera's own jitter limit the interval to some microseconds.
     const LEAST_S: f64 = 2e-6;
     let low = at((0.5 * n - half).floor()).min(delay_s - LEAST_S);
     let high = at((0.5 * n + half).ceil()).max(delay_s + LEAST_S);
@@ -264,7 +263,7 @@ fn most_agreed(spans: &[[f64; 2]]) -> [f64; 2] {
         .iter()
         .flat_map(|[low, high]| [(*low, 1), (*high, -1)])
         .collect();
-    // At the same time an interval begins before another ends.
+    // At equal times, count a beginning before an end.
     ends.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
     let (mut depth, mut deepest, mut best) = (0, 0, [0.0, 0.0]);
     for (i, (at, step)) in ends.iter().enumerate() {
@@ -278,7 +277,7 @@ fn most_agreed(spans: &[[f64; 2]]) -> [f64; 2] {
     best
 }
 
-/// Distance of two intervals, s, if it is more than `tolerance_s`; `None`: they agree.
+/// Gap between two intervals, s, if it exceeds `tolerance_s`; `None`: they agree.
 pub fn apart_s(one95_s: [f64; 2], other95_s: [f64; 2], tolerance_s: f64) -> Option<f64> {
     let gap = (other95_s[0] - one95_s[1]).max(one95_s[0] - other95_s[1]);
     (gap > tolerance_s).then_some(gap)
@@ -288,7 +287,7 @@ pub fn apart_s(one95_s: [f64; 2], other95_s: [f64; 2], tolerance_s: f64) -> Opti
 mod tests {
     use super::*;
 
-    /// Frames at 1 kHz, and the light that was on while they were exposed; each switch reaches the light later by `line_s`.
+    /// Frames at 1 kHz with the light during their exposure; each switch reaches the light `line_s` later.
     fn test_record(
         sent_s: &[f64],
         exposure_s: f64,
@@ -325,7 +324,7 @@ mod tests {
                 for delay_s in [0.000_07, 0.0007, 0.0033] {
                     let sent = dithered_edges(100, 0.011, 1e-3, 0.01, seed);
                     let mut random = Random::new(seed + 100);
-                    // Of the switches some are held up by the machine: by 0.1 to 4 ms, each fifth.
+                    // The machine delays every fifth switch by 0.1 to 4 ms.
                     let held: Vec<f64> = (0..sent.len())
                         .map(|_| match random.uniform() {
                             u if u < 0.2 => 1e-4 + 4e-3 * random.uniform(),
@@ -346,7 +345,7 @@ mod tests {
                         "{exposure_s} {delay_s} s, seed {seed}: {found:?}"
                     );
                     assert!(found.ci95_s[0] <= found.delay_s && found.delay_s <= found.ci95_s[1]);
-                    // The delay that half of the switches exceed, held up or not.
+                    // Median delay of all switches, the delayed ones included.
                     let mut all: Vec<f64> = held.iter().map(|h| delay_s + h).collect();
                     all.sort_by(f64::total_cmp);
                     let truth = 0.5 * (all[49] + all[50]);

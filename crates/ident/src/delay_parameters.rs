@@ -67,11 +67,11 @@ pub(crate) fn far_zero_parameter(
         lead_ms[0]
     };
     let width = 0.5 * (lead_ms[1] - lead_ms[0]);
-    // A lead of up to half a sampling period differs from a delay only in the rows that show it.
+    // A lead up to half a sampling period differs from a delay only in which row shows it.
     let identified = fit.best().order >= CandidateOrder::FarZero
         && lead_ms[1] < 0.5 * period_ms
         && width < WIDEST_RELATIVE * middle;
-    // With a delay from elsewhere the lead is what that delay leaves of the phase slope, and so is its interval.
+    // With a delay measured otherwise, lead and interval are the phase slope minus that delay.
     let shown_ms = match prior {
         Some(prior) if model.far_lead_s > 0.0 => {
             let (lead, half) = (model.far_lead_s * 1e3, half_ms.hypot(prior.half95_s * 1e3));

@@ -1,4 +1,4 @@
-//! What can go wrong in identification, with what would be right.
+//! Errors of identification; each says what would be right.
 
 use thiserror::Error;
 

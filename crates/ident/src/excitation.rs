@@ -1,8 +1,8 @@
-//! What to drive the plant with: stepped sines, log sweep, random-phase multisine, steps and rest.
+//! Excitation signals for the plant: stepped sines, log sweep, random-phase multisine, steps and rest.
 //!
-//! Signals are displacements to add to a command (um, peak amplitudes), one value per tick. Amplitudes are shaped by
-//! the expected plant so that the bead stays in view: in open loop 1.6 um peak to peak at 2 Hz would move it 54 um.
-//! Not for running an experiment: see [`crate::experiment`].
+//! Signals are displacements to add to a command (um, peak amplitudes), one value per tick. The expected plant shapes
+//! the amplitudes, so that the bead stays in view. In open loop, 1.6 um peak to peak at 2 Hz would move it 54 um. Not
+//! for running an experiment: see [`crate::experiment`].
 
 use nalgebra::Complex;
 
@@ -53,7 +53,7 @@ pub enum Signal {
         /// Frequency from which the amplitude is constant, Hz.
         flat_from_hz: f64,
     },
-    /// A signal over and over, each time faded in and out at its ends, so that it can be measured as a periodic one.
+    /// A repeated signal. Each repetition fades in and out, so that the whole can be measured as periodic.
     Repeated {
         /// The signal.
         signal: Box<Signal>,
@@ -72,7 +72,7 @@ pub enum Signal {
 }
 
 impl Signal {
-    /// Time after which the signal repeats itself, where only that defines its lines, s.
+    /// Period of the signal, s, if only the period defines its lines.
     pub fn repeats_s(&self) -> Option<f64> {
         match self {
             Signal::Repeated { period_s, .. } => Some(*period_s),
@@ -175,14 +175,14 @@ pub fn check_grid(
     Ok(())
 }
 
-/// Where a frequency shows after sampling, Hz in 0..rate/2.
+/// Frequency at which a sampled record shows it, Hz in 0..rate/2.
 pub fn fold(frequency_hz: f64, rate_hz: f64) -> f64 {
     let wrapped = frequency_hz.rem_euclid(rate_hz);
     wrapped.min(rate_hz - wrapped)
 }
 
-/// `count` drive lines from `low_hz` to `high_hz`, spaced evenly in the logarithm, each moved to the nearest multiple
-/// of `resolution_hz` from which harmonics 2..=`harmonics` do not fall on any other line.
+/// `count` drive lines from `low_hz` to `high_hz`, spaced evenly in the logarithm. Each is moved to the nearest
+/// multiple of `resolution_hz` whose harmonics 2..=`harmonics` miss all other lines.
 ///
 /// # Errors
 /// [`IdentError::OutOfRange`] when the band is empty, reaches half the rate, or no such grid fits in it.
@@ -208,7 +208,7 @@ pub fn drive_grid(
         });
     }
     let mut lines: Vec<f64> = Vec::with_capacity(count);
-    // From the top: high lines fold most, and low ones have the finest relative choice left.
+    // Place the high lines first: they fold most.
     for i in (0..count).rev() {
         let share = if count == 1 {
             1.0
@@ -243,7 +243,7 @@ pub fn drive_grid(
     Ok(lines)
 }
 
-/// A periodic multisine: its drive lines and the lines left out to detect nonlinearity.
+/// A periodic multisine: its drive lines, and the undriven lines that detect nonlinearity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Multisine {
     /// Driven sines with random phases.
@@ -256,8 +256,8 @@ pub struct Multisine {
     pub period_s: f64,
 }
 
-/// A random-phase multisine of period `period_s` on odd lines from `low_hz` to `high_hz`: of each group of
-/// `group` odd lines one, drawn at random, stays undriven. `amplitude_um(f)` shapes the spectrum.
+/// A random-phase multisine of period `period_s` on odd lines from `low_hz` to `high_hz`. In each group of `group` odd
+/// lines, one drawn at random is not driven. `amplitude_um(f)` shapes the spectrum.
 ///
 /// # Errors
 /// [`IdentError::OutOfRange`] when fewer than four odd lines fit in the band.
@@ -323,7 +323,7 @@ pub fn odd_multisine(
 pub struct ExcitationLimits {
     /// Largest bead amplitude (peak) that stays in view, um.
     pub bead_um: f64,
-    /// Largest bead speed (peak), um/s: beyond a few pixels per exposure the image is a smear that no localiser trusts.
+    /// Largest bead speed (peak), um/s: beyond a few pixels per exposure the image is too smeared for a localiser.
     pub bead_um_per_s: f64,
     /// Largest PZT amplitude (peak), um.
     pub pzt_um: f64,
@@ -445,7 +445,7 @@ mod tests {
             assert_eq!(repeated.value_um(time_s), sweep.value_um(time_s));
             assert!((repeated.value_um(40.0 + time_s) - sweep.value_um(time_s)).abs() < 1e-9);
         }
-        // No jump from one round to the next.
+        // The signal has no jump from one repetition to the next.
         assert!(repeated.value_um(20.0 - 1e-4).abs() < 1e-4);
     }
 }

@@ -1,7 +1,7 @@
 //! An identification experiment: a plan of excitation segments, run tick by tick on anything that moves a bead.
 //!
-//! The plan is data, the rig is a [`Bench`]. When the bead is lost the run ends cleanly with what was measured so far,
-//! and resumes at the segment that failed. Not for real-time pacing: a bench does that.
+//! The plan is data, the rig is a [`Bench`]. If the bead is lost, the run ends, keeps the finished segments, and can resume at the one
+//! that failed. Not for real-time pacing: a bench does that.
 
 use nalgebra::Complex;
 
@@ -20,13 +20,13 @@ use serde::{Deserialize, Serialize};
 pub struct Row {
     /// Displacement commanded from this tick on, um.
     pub command_um: f64,
-    /// The bead position that the tick saw, um; `None` where no frame showed a bead.
+    /// The bead position that the tick saw, um; `None` if no frame showed a bead.
     pub bead_um: Option<f64>,
 }
 
 /// A rig, real or emulated, that adds an excitation to whatever holds the bead.
 pub trait Bench {
-    /// What can go wrong in the rig itself.
+    /// Errors of the rig itself.
     type Error;
     /// Runs one tick with `excitation_um` added to the command (closed loop) or about the working point (open loop).
     ///
@@ -46,7 +46,7 @@ pub struct PlannedSegment {
     pub lines_hz: Vec<f64>,
     /// Lines fitted along to detect nonlinearity, Hz.
     pub detection_hz: Vec<f64>,
-    /// Time for transients to die, s; recorded, not used.
+    /// Time for transients to decay, s; recorded, not evaluated.
     pub settle_s: f64,
     /// Time used, s.
     pub measure_s: f64,
@@ -66,12 +66,12 @@ pub struct Plan {
     pub lost_frames: usize,
 }
 
-/// A segment to be run, and how strongly.
+/// A segment to run, and its amplitude.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Turn {
     /// Index of the segment in the plan.
     pub index: usize,
-    /// Amplitude over the planned one.
+    /// Amplitude relative to the planned one.
     pub part: f64,
 }
 
@@ -87,8 +87,8 @@ impl Turn {
 pub type Expected<'a> = &'a dyn Fn(f64) -> (Complex<f64>, Complex<f64>);
 
 impl Plan {
-    /// Stepped sines, one segment per line, lowest first. Low lines last longer: Brownian motion makes the noise of a
-    /// line fall as 1/f.
+    /// Stepped sines, one segment per line, lowest first. Low lines last longer, because Brownian motion makes the noise of a line fall
+    /// as 1/f.
     pub fn stepped_sines(
         lines_hz: &[f64],
         expected: Expected<'_>,
@@ -127,10 +127,9 @@ impl Plan {
         }
     }
 
-    /// All lines at once with random phases, after a settling time. Each line gets the share of the bead's and the PZT's
-    /// amplitude that keeps the expected peak (three times the RMS) within `limits`. Lines are moved to whole multiples
-    /// of 0.5 Hz (odd ones, so that even nonlinearity falls between them); the even neighbours of every third line are
-    /// watched as detection lines.
+    /// All lines at once with random phases, after a settling time. Each line gets the share of the bead's and the PZT's amplitude that
+    /// keeps the expected peak (three times the RMS) within `limits`. Lines are moved to odd multiples of 0.5 Hz, so that even
+    /// nonlinearity falls between them. The even neighbours of every third line serve as detection lines.
     pub fn multisine(
         lines_hz: &[f64],
         expected: Expected<'_>,
@@ -184,9 +183,9 @@ impl Plan {
         }
     }
 
-    /// A logarithmic sweep from the lowest line to the highest, repeated every four seconds and measured at the lines (moved to
-    /// multiples of 0.25 Hz), at which it is periodic. Its amplitude is the largest that keeps the expected bead
-    /// and PZT within `limits` at every frequency, so low lines get less than a stepped sine would give them.
+    /// A logarithmic sweep from the lowest line to the highest, repeated every four seconds. It is measured at the lines, moved to
+    /// multiples of 0.25 Hz, where it is periodic. It has one amplitude: the largest that keeps the expected bead and PZT within `limits`
+    /// at every frequency. Low lines therefore get less than from a stepped sine.
     pub fn log_sweep(
         lines_hz: &[f64],
         expected: Expected<'_>,
@@ -203,7 +202,7 @@ impl Plan {
         lines.dedup();
         let lowest = lines.first().copied().unwrap_or(1.0);
         let highest = lines.last().copied().unwrap_or(lowest);
-        // A quarter of an octave beyond the outer lines, so that they are passed at full amplitude.
+        // The sweep extends a quarter of an octave beyond the outer lines, to pass them at full amplitude.
         let nyquist_hz = 0.5 / period_s;
         let (from_hz, to_hz) = (0.84 * lowest, (1.19 * highest).min(0.96 * nyquist_hz));
         let amplitude_um = (0..=60)
@@ -239,8 +238,8 @@ impl Plan {
         }
     }
 
-    /// The excitation of the segments `todo` as one table, for a rig that runs without stopping between them: each
-    /// settled, measured and faded out as [`Plan::run`] does it, at the part of its planned amplitude that is asked for.
+    /// The excitation of the segments `todo` as one table, for a rig that does not stop between them. Each segment settles, is measured
+    /// and fades out as in [`Plan::run`], at the requested part of its planned amplitude.
     pub fn schedule(&self, todo: &[Turn]) -> Schedule {
         let mut schedule = Schedule {
             excitation_um: Vec::new(),
@@ -288,7 +287,7 @@ impl Plan {
             .sum()
     }
 
-    /// Runs the segments from index `first` on; `progress` hears the ticks done so far.
+    /// Runs the segments from index `first` on; calls `progress` with the ticks done so far.
     ///
     /// # Errors
     /// [`Stopped`] with the finished segments and the cause.
@@ -344,8 +343,8 @@ impl Plan {
                     progress(ticks);
                 }
             }
-            // Fade out: in closed loop the excitation balances the controller's share, and dropping it at once would
-            // fling the bead out of view.
+            // Fade out: in closed loop the excitation balances the controller's share; dropping it at once would throw the bead out of
+            // view.
             let release = rows(RELEASE_S, self.period_s);
             for k in 0..release {
                 let excitation_um = fade_out(k, release)
@@ -363,9 +362,9 @@ impl Plan {
         Ok(done)
     }
 
-    /// Measures the response at every driven line of the recorded segments and brings the noise model in. Each point is told how much
-    /// older its frames were than [`common_age_s`]: the clock of a camera that runs freely drifts through the loop's grid in a
-    /// minute, and each segment meets another part of it.
+    /// Measures the response at every driven line of the recorded segments, and weights the points by the noise model. Each point records
+    /// how much older its frames were than [`common_age_s`]: a free-running camera clock drifts through the loop's grid in a minute, so
+    /// the age differs between segments.
     ///
     /// # Errors
     /// Those of [`measure`].
@@ -414,7 +413,7 @@ impl Plan {
     }
 }
 
-/// Second and third harmonic of a line, folded, where they fall on neither the line, zero nor half the rate.
+/// Second and third harmonic of a line after folding, unless they fall on the line, zero or half the rate.
 fn harmonics_to_watch(frequency_hz: f64, rate_hz: f64) -> Vec<f64> {
     let mut out: Vec<f64> = Vec::new();
     for h in [2.0, 3.0] {
@@ -436,7 +435,7 @@ fn fade_out(k: usize, release: usize) -> f64 {
     0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos()
 }
 
-/// Why a run ended early, and its results so far.
+/// The finished segments of a run that ended early, and the cause.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stopped<E> {
     /// Segments finished before.
@@ -445,7 +444,7 @@ pub struct Stopped<E> {
     pub cause: Cause<E>,
 }
 
-/// What ended a run early.
+/// The cause of an early end.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Cause<E> {
     /// The rig failed.
@@ -459,7 +458,7 @@ pub enum Cause<E> {
 pub struct Measured {
     /// Driven lines in order of frequency.
     pub points: Vec<FrequencyPoint>,
-    /// The noise model, where there were enough lines for one.
+    /// The noise model, if there were enough lines.
     pub noise: Option<NoiseModel>,
     /// Per segment, detection lines included.
     pub segments: Vec<SegmentResponse>,

@@ -1,9 +1,9 @@
-//! Records of a loop: whether the input answers the output, and the response that is right when it does.
+//! Records of a closed loop: a test whether the input answers the output, and a response without bias if it does.
 //!
-//! With feedback the input holds the output's noise. Cross-spectrum over input spectrum then tends to minus the inverse of
-//! the controller where the noise outweighs the excitation, and no averaging helps. A signal that the noise is not in, the
-//! reference or an added excitation, tells the plant from the controller: both input and output are projected on it, and
-//! their ratio is the plant's response (joint input-output, or instrument).
+//! With feedback, the input contains the output's noise. If the noise outweighs the excitation, cross-spectrum over input
+//! spectrum tends to minus the inverse of the controller, and averaging does not help. A noise-free signal, the reference or an
+//! added excitation, separates plant and controller. Input and output are both projected on it, and the ratio of the projections
+//! is the plant's response (joint input-output method, instrumental variable).
 
 pub use crate::spectral::by_reference;
 use nalgebra::{DMatrix, DVector};
@@ -18,14 +18,14 @@ pub struct Feedback {
 }
 
 impl Feedback {
-    /// Whether that is beyond chance and large enough to bend an estimate.
+    /// Whether that is significant, and large enough to bias an estimate.
     pub fn is_there(self) -> bool {
         self.share > 0.05 && self.f > 10.0
     }
 }
 
-/// Looks for feedback: does the past of the output help to predict the input, beyond the input's own past (Granger)? Rows
-/// without an output are left out. None in a record too short or too still to tell.
+/// Tests for feedback: does the past of the output help to predict the input, beyond the input's own past (Granger)? Skips rows
+/// without an output. None if the record is too short or its input hardly moves.
 pub fn feedback(input: &[f64], output: &[f64]) -> Option<Feedback> {
     const LAGS: usize = 8;
     const MOST_ROWS: usize = 40_000;
@@ -65,7 +65,7 @@ pub fn feedback(input: &[f64], output: &[f64]) -> Option<Feedback> {
     let (own, both) = (left(&own)?, left(&full)?);
     let moved = target.norm_squared();
     if own <= 1e-9 * moved || own <= 0.0 {
-        // The input's past predicts it completely: nothing is left for an output to explain.
+        // The input's past predicts it completely, so the output can explain nothing more.
         return Some(Feedback { share: 0.0, f: 0.0 });
     }
     let freedom = (rows.len() - 2 * LAGS - 1) as f64;

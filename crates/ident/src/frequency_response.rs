@@ -1,10 +1,10 @@
 //! Frequency response at known lines, with variances from period-to-period scatter and coherence.
 //!
 //! **Joint input-output method**: input and output are both projected on the excitation, whose frequencies and phases
-//! are known, and the response is the ratio of the two means. In closed loop the feedback carries noise into the
-//! input; that noise is not tied to the excitation, so it averages out of both projections and the ratio stays free of
-//! bias however low the coherence. The direct estimate (cross-spectrum over input spectrum) is offered by name, to
-//! show the bias that it has. Not for records without a periodic excitation: see [`crate::spectral`].
+//! are known. The response is the ratio of the two means. In closed loop the feedback carries noise into the input.
+//! This noise does not correlate with the excitation, so it averages out of both projections, and the ratio has no bias
+//! even at low coherence. The direct estimate (cross-spectrum over input spectrum) is offered by name, to show its
+//! bias. Not for records without a periodic excitation: see [`crate::spectral`].
 
 use nalgebra::Complex;
 
@@ -51,8 +51,8 @@ pub struct Settings {
     pub most_blocks: usize,
     /// How the response is formed.
     pub estimator: Estimator,
-    /// Blocks hold whole multiples of this, s, rather than of the lowest line's period: for an excitation with more
-    /// lines than are measured, which are orthogonal over its own period only.
+    /// Blocks hold whole multiples of this time, s, instead of the lowest line's period. Needed if the excitation has
+    /// more lines than are measured: they are orthogonal only over its own period.
     pub block_s: Option<f64>,
 }
 
@@ -77,7 +77,7 @@ pub struct FrequencyPoint {
     pub response: Complex<f64>,
     /// Variance of `response`, `E|error|^2` (real and imaginary part share it equally), from the scatter of blocks.
     pub scatter_variance: f64,
-    /// Variance to weight with: from the noise model where one fits all lines, else the scatter.
+    /// Variance for the weights: from the noise model if one fits all lines, else from the scatter.
     pub variance: f64,
     /// Degrees of freedom of `variance` (infinite for a known noise level).
     pub variance_dof: f64,
@@ -87,7 +87,7 @@ pub struct FrequencyPoint {
     pub input: Complex<f64>,
     /// Mean output phasor (peak amplitude, output unit).
     pub output: Complex<f64>,
-    /// Response of each block less `response`, to first order: the pool of the bootstrap.
+    /// Response of each block minus `response`, to first order: the pool of the bootstrap.
     pub block_errors: Vec<Complex<f64>>,
     /// Rows used.
     pub rows: usize,
@@ -130,7 +130,7 @@ impl FrequencyPoint {
     }
 }
 
-/// What a detection line holds: output that no driven line put there.
+/// Result at a detection line: output that no driven line causes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DetectionLine {
     /// Frequency, Hz.
@@ -141,7 +141,8 @@ pub struct DetectionLine {
     pub input: Complex<f64>,
     /// Standard deviation of the output's amplitude from block scatter (root of `E|error|^2`).
     pub output_sd: f64,
-    /// Probability that noise alone shows this much (Hotelling's test of a complex mean); infinite blocks not assumed.
+    /// Probability that noise alone shows this much (Hotelling's test of a complex mean, for a finite number of
+    /// blocks).
     pub p_value: f64,
 }
 
@@ -203,8 +204,8 @@ pub fn measure(
     let mut inputs: Vec<Vec<Complex<f64>>> = Vec::new();
     let mut outputs: Vec<Vec<Complex<f64>>> = Vec::new();
     let (mut used, mut residual) = (0, 0.0);
-    // On an integrating plant the increments of the output answer the levels of the input. Increments on both sides
-    // would let the input's noise at a block's two ends in, multiplied by the large gain of a low line.
+    // On an integrating plant the increments of the output follow the levels of the input. Increments of both would add
+    // the input's noise at the two ends of a block, multiplied by the large gain of a low line.
     let input_fit = match settings.fit.whitening {
         Whitening::Levels => settings.fit,
         Whitening::Increments => ToneFit {
@@ -218,7 +219,7 @@ pub fn measure(
             fit(segment.input, input_fit),
             fit(segment.output, settings.fit),
         ) {
-            // A block that lost half its frames would weigh as much as a full one.
+            // Skip a block that lost half its frames: it would weigh as much as a full one.
             if 2 * y.rows > w[1] - w[0] {
                 used += y.rows;
                 residual += y.residual_variance;

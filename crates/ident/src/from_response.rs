@@ -1,8 +1,7 @@
-//! A base model from a frequency response that somebody else has measured: a table of frequency and complex gain.
+//! A base model from a frequency response measured elsewhere: a table of frequency and complex gain.
 //!
-//! Nothing is known of its errors, so every point counts by its own size, and the form is chosen as a base's is: every second
-//! point is predicted by a fit to the others, and every number more must pay for itself. Not for records in time: see
-//! [`crate::base`].
+//! Its errors are unknown, so each point is weighted by its own size. The form is chosen as in [`crate::base`]: a fit to every
+//! other point predicts the rest, and each further number must lower that error. Not for records in time: see [`crate::base`].
 
 use crate::base::Form;
 use crate::error::IdentError;
@@ -51,9 +50,9 @@ pub struct ResponseFit {
     pub form: Form,
     /// The model.
     pub model: RationalFit,
-    /// RMS of measured over fitted response less one.
+    /// RMS of measured over fitted response, minus one.
     pub relative_error: f64,
-    /// The same of every second point, predicted by a fit to the others.
+    /// The same for every second point, predicted by a fit to the others.
     pub held_out_error: f64,
     /// Largest deviation of the gain, dB.
     pub worst_db: f64,
@@ -61,17 +60,17 @@ pub struct ResponseFit {
     pub worst_deg: f64,
 }
 
-/// By what factor the error of prediction must fall for every number more.
+/// Each further number must reduce the prediction error to this part of it.
 const PER_NUMBER: f64 = 0.9;
 
-/// Errors below this part of the response are those of the instrument and of the digits in the file.
+/// Relative errors below this come from the instrument and from the digits in the file.
 const AS_GOOD_AS_NONE: f64 = 1e-3;
 
-/// Relative error that points are taken to have: their spread about the fit decides.
+/// Assumed relative error of the points; their spread about the fit then scales it.
 const NOMINAL: f64 = 1e-6;
 
-/// Fits a response with the form that is asked for, or with the simplest up to `most_order` that predicts every second point as
-/// well as any.
+/// Fits a response with the requested form, or with the simplest up to `most_order` that predicts every second point as well as
+/// any other.
 ///
 /// # Errors
 /// [`IdentError::TooFewPoints`], [`IdentError::OutOfRange`] (a frequency or a response without a value), [`IdentError::NoFit`].
@@ -171,7 +170,7 @@ fn longest_delay_s(points: &[Measured]) -> f64 {
     (1.2 * turned.abs() / (TAU * last.hz)).max(1.0 / last.hz)
 }
 
-/// Fits to all points, and to every second one, which must predict the others.
+/// Fits all points, then every second one, which must predict the others.
 fn trial(points: &[Measured], form: Form, longest_s: f64) -> Result<ResponseFit, IdentError> {
     let all = fitted(points, form, longest_s)?;
     let (mut sum, mut count) = (0.0, 0);
@@ -202,7 +201,7 @@ fn trial(points: &[Measured], form: Form, longest_s: f64) -> Result<ResponseFit,
     })
 }
 
-/// Measured over fitted response, less one.
+/// Measured over fitted response, minus one.
 fn off(model: &RationalFit, p: &Measured) -> Complex<f64> {
     let delayed = model.response(p.hz) * Complex::from_polar(1.0, -TAU * p.hz * model.delay_s);
     p.response / delayed - 1.0
@@ -218,7 +217,7 @@ fn fitted(points: &[Measured], form: Form, longest_s: f64) -> Result<RationalFit
         exposure_s: 0.0,
         hold: Hold::None,
     };
-    // Behind a pole at zero the rest may be of a higher degree than its poles: it is fitted with one pole more, far away.
+    // Without its pole at zero, the rest may have more zeros than poles: it is fitted with one more pole, far away.
     if zeros > poles {
         return Err(NO_FIT);
     }
@@ -236,7 +235,7 @@ fn fitted(points: &[Measured], form: Form, longest_s: f64) -> Result<RationalFit
     Ok(model)
 }
 
-/// A point as the fit weighs it: of a plant that integrates, without the pole at zero.
+/// A point as the fit uses it: for an integrating plant, without the pole at zero.
 fn weighed(p: &Measured, form: Form) -> FrequencyPoint {
     let integrator = match form.integrating {
         true => Complex::new(0.0, TAU * p.hz),

@@ -1,8 +1,8 @@
 //! Quality of each parameter: intervals by covariance and by bootstrap, and a verdict.
 //!
-//! No parameter leaves without an interval and a verdict. A parameter is identified when the chosen order holds it and
-//! its 95 % interval is narrower than half the value on either side; the slow pole and the far zero are judged on the
-//! profile of the fit, where a delay may trade against the far zero. Not for choosing a model: [`crate::order_selection`].
+//! Every parameter gets an interval and a verdict. A parameter is identified if the chosen order contains it and its 95 % interval is
+//! narrower than half the value on either side. Slow pole and far zero are judged on the profile of the fit, because a delay may trade
+//! against the far zero. Not for choosing a model: [`crate::order_selection`].
 
 use nalgebra::Complex;
 
@@ -17,19 +17,19 @@ use crate::order_selection::{
 };
 use cellpos_numeric::statistics::{quantile, student_t_quantile};
 
-/// The parameters of a fit of candidate orders with verdicts, and the model to go on with.
+/// The parameters of a fit of candidate orders with verdicts, and the model to use.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Judged {
     /// One entry per parameter of Eq. (4) with delay.
     pub parameters: Vec<IdentifiedParameter>,
-    /// The chosen model, with the delay of the prior where there is one.
+    /// The chosen model, with the delay of the prior if there is one.
     pub model: CandidateModel,
     /// Interval of the delay from the phase slope alone, far zero included (upper end infinite where unbounded), s.
     pub phase_delay95_s: [f64; 2],
     /// Best delay from the phase slope alone, s: the smallest far-zero lead that the data allow.
     pub phase_delay_s: f64,
-    /// By how much the delay that was measured otherwise and the phase slope contradict each other, s. The record's own delay is
-    /// taken then: it is the one that the loop lives with.
+    /// Contradiction between the delay measured otherwise and the phase slope, s. The model then uses the record's own delay, which is
+    /// the one that acts in the loop.
     pub contradiction_s: Option<f64>,
 }
 
@@ -43,10 +43,10 @@ impl Judged {
 /// 95 % threshold of a profile's rise, chi-squared with one degree of freedom.
 const PROFILE_RISE: f64 = 3.841;
 
-/// From a 95 % interval to one of 99.9 %: two of 95 % miss each other in some runs of a hundred with nothing wrong.
+/// Factor from a 95 % to a 99.9 % interval: two 95 % intervals fail to overlap by chance in a few runs of a hundred.
 const SURE: f64 = 3.29 / 1.96;
 
-/// What neither LED test nor phase slope accounts for, s: half of a step of the converter's update, 0.1 ms.
+/// Error that neither LED test nor phase slope covers, s: half of the converter's update step of 0.1 ms.
 const NOT_ACCOUNTED_S: f64 = 5e-5;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
@@ -60,7 +60,7 @@ fn lead_interval_ms(
         .candidates
         .iter()
         .find(|r| r.order == CandidateOrder::FarZero)?;
-    // The weak bound on the lead itself must not decide how far the data let it go.
+    // Without the weak bound on the lead: the data alone must limit it.
     let bound = |lead_ms: f64| (lead_ms / (0.3 * period_ms)).powi(2);
     let chi2_at = |lead_ms: f64| -> f64 {
         [0.0, 0.08, -0.08]
@@ -137,10 +137,10 @@ fn judge_width(value: f64, interval: [f64; 2], why_not: &str) -> Identifiability
     }
 }
 
-/// The bootstrap's interval of a function of the parameters, where enough replicates were fitted.
+/// The bootstrap's interval of a function of the parameters, if enough replicates were fitted.
 type Drawn<'a> = dyn Fn(&dyn Fn(&[f64]) -> f64) -> Option<[f64; 2]> + 'a;
 
-/// Judges candidates that were fitted without a delay prior; `prior` is then brought in for the model to go on with.
+/// Judges candidates that were fitted without a delay prior; `prior` then enters the resulting model.
 ///
 /// `replicates` bootstrap fits (0: none) resample the blocks of every line with replacement; see [`bootstrap`].
 pub fn judge(
@@ -161,7 +161,7 @@ pub fn judge(
         (draws.len() >= 40).then(|| {
             let values: Vec<f64> = draws.iter().map(|x| f(x)).collect();
             let value = f(&best.parameters);
-            // A new draw lies below the k-th of n in k of n + 1 cases.
+            // A new draw is below the k-th of n in k of n + 1 cases.
             let n = values.len() as f64;
             [0.025, 0.975].map(|share| {
                 let place = ((n + 1.0) * share - 1.0) / (n - 1.0);
@@ -251,8 +251,8 @@ pub fn judge(
     }
 }
 
-/// By how much a delay that was measured otherwise and the phase slope contradict each other beyond chance, s: the gap between their
-/// 95 % intervals, where those of 99.9 % do not touch either. Delays in ms: effective, half of its interval, the far zero's lead.
+/// Significant contradiction between a delay measured otherwise and the phase slope, s: the gap between their 95 % intervals, if their
+/// 99.9 % intervals do not touch either. Delays in ms: effective, half of its interval, the far zero's lead.
 fn contradiction_s(
     fit: &CandidateFits,
     prior: DelayPrior,
@@ -298,7 +298,7 @@ fn contradicted(
     };
 }
 
-/// Zero and pole of the pair, where a fit has them.
+/// Zero and pole of the pair, if a fit has them.
 fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<IdentifiedParameter> {
     let best = fit.best();
     let pole = (
@@ -353,7 +353,7 @@ fn pair_parameters(fit: &CandidateFits, t: f64, drawn: &Drawn) -> Vec<Identified
     found
 }
 
-/// The chosen order fitted again with the delay measured otherwise, and the far zero free to make up the difference.
+/// Fits the chosen order again with the delay measured otherwise; the far zero is free to account for the difference.
 fn with_prior(
     problem: &OrderSelection<'_>,
     fit: &CandidateFits,

@@ -7,7 +7,7 @@ pub enum Identifiability {
     Identified,
     /// The band excited does not determine it; the reason in a sentence.
     NotIdentifiable {
-        /// What the data do say, and what trades against it.
+        /// What the data do determine, and what trades against the parameter.
         reason: String,
     },
 }
@@ -40,7 +40,7 @@ pub struct IdentifiedParameter {
     pub value: f64,
     /// 95 % interval by covariance (infinite ends where the data give no bound).
     pub ci95: [f64; 2],
-    /// 95 % interval by bootstrap, where one was run.
+    /// 95 % interval by bootstrap, if one was run.
     pub bootstrap95: Option<[f64; 2]>,
     /// The verdict.
     pub verdict: Identifiability,

@@ -34,8 +34,8 @@ impl<F: Fn(&[f64], &mut [f64])> Problem<'_, F> {
         out
     }
 
-    /// Central differences; where the residuals jump within a step (a delay that crosses a whole sample moves the
-    /// feedthrough to the next row at once) the difference on the smooth side.
+    /// Central differences. If the residuals jump within a step (a delay that crosses a whole sample moves the
+    /// feedthrough to the next row), it takes the difference on the smooth side.
     fn differences(&self) -> DMatrix<f64> {
         let mut j = DMatrix::zeros(self.rows, self.x.len());
         let here = self.evaluate(self.x.as_slice());
@@ -75,7 +75,7 @@ impl<F: Fn(&[f64], &mut [f64])> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'
     }
 
     fn residuals(&self) -> Option<DVector<f64>> {
-        // A step to where the model has no value is worse than any other: it is taken back and shortened.
+        // A point without a value counts as worse than any other, so the solver shortens the step.
         let worst = 1e100;
         Some(
             self.evaluate(self.x.as_slice())
@@ -108,7 +108,7 @@ pub fn minimise<F: Fn(&[f64], &mut [f64])>(
         .with_gtol(1e-12)
         .with_patience(60)
         .minimize(problem);
-    // Exhausted precision next to a minimum is a minimum too: only lost patience and failed evaluations are not.
+    // A stop for lack of precision is at a minimum too; only too many evaluations and failed ones are not.
     let converged = match report.termination {
         TerminationReason::Converged { .. }
         | TerminationReason::ResidualsZero
@@ -131,8 +131,8 @@ pub fn minimise<F: Fn(&[f64], &mut [f64])>(
     }
 }
 
-/// Inverse of `J^T J`, computed with scaled columns; directions that the data do not see at all (relative singular
-/// value below 1e-9) get an infinite variance on the parameters that they move.
+/// Inverse of `J^T J`, computed with scaled columns. Parameters in a direction that the data do not determine (relative
+/// singular value below 1e-9) get an infinite variance.
 pub fn covariance(jacobian: &DMatrix<f64>) -> DMatrix<f64> {
     let n = jacobian.ncols();
     let scales: Vec<f64> = (0..n).map(|i| jacobian.column(i).norm()).collect();

@@ -1,9 +1,9 @@
 //! Excitation, frequency response, delay, and model fit with confidence intervals.
 //!
-//! From records of commanded displacement and bead position to a model whose every parameter has an interval and a
-//! verdict. Pure computation: no device, no clock, no file. Frequencies are in Hz, angles in degrees at boundaries;
-//! angular frequency only inside. A record follows the project's convention: row k holds the command applied from
-//! `t_k` on and the position just before it takes effect.
+//! Turns records of commanded displacement and bead position into a model. Every parameter of the model has an interval and a
+//! verdict. Pure computation: no device, no clock, no file. Frequencies are in Hz, angles in degrees at boundaries; angular
+//! frequency only inside. A record follows the project's convention: row k holds the command applied from `t_k` on and the
+//! position just before it takes effect.
 //!
 //! - [`excitation`] and [`experiment`]: the signals, and the plan of a measurement.
 //! - [`frequency_response`], [`tone_fit`], [`spectral`]: gain and phase with standard deviations.

@@ -1,9 +1,9 @@
 //! The noise of a bead's position record from the scatter at many lines: Brownian motion plus localisation noise.
 //!
 //! Increments of a record hold `2 D T` of Brownian motion at every frequency and `s^2 |1 - e^(-jwT)|^2` of localisation
-//! noise. Two numbers fitted to the scatter of all lines have far more degrees of freedom than one line's own scatter,
-//! so weights stop being noisy themselves. Where the two numbers do not describe the scatter (another rig, another
-//! disturbance), the scatter stands. Not for detecting what such a disturbance is.
+//! noise. Two numbers fitted to the scatter of all lines have far more degrees of freedom than the scatter of one line,
+//! so the weights are less noisy. If the two numbers do not describe the scatter (another rig, another disturbance),
+//! the scatter is used as measured. Not for finding the cause of such a disturbance.
 
 use nalgebra::Complex;
 
@@ -21,7 +21,7 @@ pub struct NoiseModel {
     pub localisation_um: f64,
     /// Degrees of freedom behind the two numbers.
     pub dof: f64,
-    /// Probability of a scatter at least this uneven if the model is right.
+    /// Probability of a scatter at least this uneven if the model is correct.
     pub p_value: f64,
     /// Whether the model is used for the weights.
     pub used: bool,
@@ -33,7 +33,7 @@ fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
     (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr()
 }
 
-/// Fits the noise model to the scatter of `points` and, where it holds (p > 0.005), sets their `variance` by it.
+/// Fits the noise model to the scatter of `points`; if the model holds (p > 0.005), sets their `variance` from it.
 pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option<NoiseModel> {
     // Per point: scatter of increments per row, the localisation regressor, degrees of freedom.
     let data: Vec<(f64, f64, f64)> = points

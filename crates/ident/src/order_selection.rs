@@ -1,9 +1,9 @@
-//! Fit of candidate models of rising order to a frequency response, and the choice of the order that the data support.
+//! Fits candidate models of rising order to a frequency response, and chooses the order that the data support.
 //!
-//! Complex, weighted least squares on the record's response (hold, delay and exposure are in the model, not removed from the data).
-//! Candidates: integrator with delay; with a pole-zero pair; with two lags, and with a zero beside them; with the far zero; full Eq. (4). A higher order is
-//! taken only when an F-test rejects the lower one (1 %), AICc falls, and the fit to one half of the blocks predicts
-//! the other half better. The quality of a parameter comes from [`crate::identifiability`].
+//! Complex, weighted least squares on the record's response; hold, delay and exposure are in the model, not removed from the data. The
+//! candidates are an integrator with delay, then with a pole-zero pair, with two lags, with two lags and a zero, with the far zero, and
+//! full Eq. (4). A higher order is chosen only if three tests agree: an F-test rejects the lower one (1 %), AICc falls, and the fit to
+//! one half of the blocks predicts the other half better. The quality of a parameter comes from [`crate::identifiability`].
 
 pub use crate::candidate_order::{
     CandidateFit, CandidateFits, CandidateOrder, DelayPrior, index, model_of,
@@ -24,7 +24,7 @@ pub struct OrderSelection<'a> {
     sampling: Sampling,
     prior: Option<DelayPrior>,
     weights: Vec<f64>,
-    /// By how much the two weak bounds (share, lead) are moved, in their standard deviations.
+    /// Shift of the two weak bounds (share, lead), in their standard deviations.
     bounds_moved: [f64; 2],
     /// Orders with two lags are candidates.
     two_lags: bool,
@@ -33,11 +33,11 @@ pub struct OrderSelection<'a> {
 /// Finite-difference steps of the parameter vector.
 const STEPS: [f64; 7] = [1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 1e-4, 1e-4];
 
-/// What is known of the far zero's lead before any fit: about zero, to this part of a sampling period. A lead of a
-/// period or more would be a second delay.
+/// Prior of the far zero's lead: zero, with this part of a sampling period as standard deviation. A lead of a period or more would be a
+/// second delay.
 const LEAD_SD_PERIODS: f64 = 0.3;
 
-/// What is known of the feedthrough's share one row later: between 0 and 1.
+/// Prior of the feedthrough's share one row later: between 0 and 1.
 const SHARE_MIDDLE_SD: (f64, f64) = (0.5, 0.5);
 
 impl<'a> OrderSelection<'a> {
@@ -95,8 +95,8 @@ impl<'a> OrderSelection<'a> {
         out[last] = self
             .prior
             .map_or(0.0, |prior| (model.delay_s - prior.delay_s) / prior.sd_s);
-        // Behind a hold the lead trades exactly with the delay, and the share with the lead: without these two weak
-        // bounds the directions would be open.
+        // Behind a hold the lead trades exactly with the delay, and the share with the lead. These two weak bounds keep both directions
+        // determined.
         let (middle, sd) = SHARE_MIDDLE_SD;
         let [share_moved, lead_moved] = self.bounds_moved;
         (out[last + 1], out[last + 2]) = match model.feedthrough_share {
@@ -121,15 +121,15 @@ impl<'a> OrderSelection<'a> {
         self
     }
 
-    /// The same problem with the orders of two lags among the candidates, or without them. A PZT has none: there they would take what
-    /// an unknown effect does for a part of the plant.
+    /// The same problem with or without the orders of two lags. A plant driven by a PZT has no such lags; there they would absorb an
+    /// unknown effect.
     pub fn with_two_lags(mut self, two_lags: bool) -> Self {
         self.two_lags = two_lags;
         self
     }
 
-    /// The same problem with the weak bounds on the feedthrough's share and on the far zero's lead moved, in standard deviations:
-    /// prior knowledge is uncertain too, and each replicate of the fit draws it again.
+    /// The same problem with the weak bounds (feedthrough share, far-zero lead) shifted, in standard deviations. A prior is uncertain
+    /// too, so each replicate of the fit draws it again.
     pub fn with_bounds_moved(mut self, share_and_lead: [f64; 2]) -> Self {
         self.bounds_moved = share_and_lead;
         self
@@ -182,7 +182,7 @@ impl<'a> OrderSelection<'a> {
         found
     }
 
-    /// Gain and delay that start the iteration: the delay by a grid, since phase wraps.
+    /// Start values of gain and delay. The delay comes from a grid, because phase wraps.
     fn first_guess(&self, data: &[Complex<f64>]) -> [f64; 2] {
         let mut best = (f64::INFINITY, [0.0, 0.0]);
         let period_ms = self.sampling.period_s * 1e3;
@@ -198,7 +198,7 @@ impl<'a> OrderSelection<'a> {
             let (mut cross, mut power) = (0.0, 0.0);
             for ((p, y), w) in self.points.iter().zip(data).zip(&self.weights) {
                 let h = unit.sampled_response(p.frequency_hz, delay_ms * 1e-3, self.sampling);
-                // Relative weights with a ceiling: the start must not hang on one very precise line.
+                // Relative weights with a ceiling: the start must not depend on one very precise line.
                 let weight = (w * y.norm()).min(100.0) / y.norm();
                 cross += weight * weight * (y * h.conj()).re;
                 power += weight * weight * h.norm_sqr();
@@ -212,7 +212,7 @@ impl<'a> OrderSelection<'a> {
         best.1
     }
 
-    /// The best fit of `order` over several starts, the order below included.
+    /// The best fit of `order` over several starts; one is the result of the order below.
     fn fit_rung(
         &self,
         data: &[Complex<f64>],
@@ -242,7 +242,7 @@ impl<'a> OrderSelection<'a> {
             (CandidateOrder::TwoLags, Some(x)) => {
                 let (low, high) = self.band_rad_per_s();
                 let at = |share: f64| low.ln() + share * (high / low).ln();
-                // The integrator's delay did for the lags.
+                // The delay of the integrator's fit contains the lags.
                 for (second, first) in [(0.9, 0.4), (0.9, 0.7), (0.7, 0.5), (1.1, 0.9)] {
                     extend(&[x[0], 0.0], &[at(second), at(first)]);
                 }
@@ -254,8 +254,8 @@ impl<'a> OrderSelection<'a> {
                 }
             }
             (CandidateOrder::FarZero, Some(x)) => {
-                // First with the lead held: where the delay crosses half a sample the feedthrough moves to another
-                // row at once, and a long first step would cross into the wrong one.
+                // First with a fixed lead: when the delay crosses half a sample the feedthrough jumps to another row, and a long first
+                // step could end in the wrong one.
                 for share in [0.03, 0.1, 0.3] {
                     let lead_ms = share * self.sampling.period_s * 1e3;
                     let mut start = x.to_vec();
@@ -376,7 +376,7 @@ impl<'a> OrderSelection<'a> {
         } else {
             variance_dof
         };
-        // Weights that are themselves estimated from few blocks make intervals too short by this factor.
+        // Weights estimated from few blocks make intervals too short by this factor.
         let weight_noise = if from_scatter && variance_dof > 2.5 {
             variance_dof / (variance_dof - 2.0)
         } else {
@@ -428,15 +428,14 @@ impl<'a> OrderSelection<'a> {
         for i in 1..orders.len() {
             let (low, high) = (&orders[chosen], &orders[i]);
             let more = (high.order.parameters() - low.order.parameters()) as f64;
-            // Of two orders with as many parameters neither is a case of the other: the data alone decide.
+            // Two orders with equally many parameters are not nested: the data alone decide.
             let p_value = if more > 0.0 {
                 let gained = (low.chi2 - high.chi2).max(0.0) / more / scale;
                 f_exceeds(gained, more, interval_dof.min(1e4))
             } else {
                 0.0
             };
-            // Eq. (1)-(3) are passive: an order that explains more with an unstable pole has found something else.
-            // Nor does a bead answer before the command.
+            // Eq. (1)-(3) are passive, so an order with an unstable pole describes something else. A negative delay is impossible too.
             let passive = high.model.slow_pole_rad_per_s >= 0.0
                 && (high.model.delay_s >= 0.0 || !high.order.two_lags());
             if p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out && passive {

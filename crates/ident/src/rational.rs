@@ -1,9 +1,9 @@
 //! Rational models of any linear order with a delay, fitted to a frequency response.
 //!
-//! For records of other rigs, whose plant is not Eq. (4): `G(s) = B(s)/A(s) e^(-sL)`, orders from a static gain up,
-//! chosen by AICc. Started by Sanathanan-Koerner iterations, finished by Levenberg-Marquardt on the exact sampled
-//! response. Time is scaled by the band's middle, so that coefficients are of order one. Not for Eq. (4) itself:
-//! [`crate::order_selection`] knows its parameters.
+//! For records of other rigs, whose plant is not Eq. (4): `G(s) = B(s)/A(s) e^(-sL)`, from a static gain up; AICc chooses the
+//! order. Sanathanan-Koerner iterations give the start, Levenberg-Marquardt on the exact sampled response the result. The band's
+//! middle sets the unit of time, so that coefficients are of order one. Not for Eq. (4) itself: [`crate::order_selection`] knows
+//! its parameters.
 
 use nalgebra::{Complex, DMatrix, DVector};
 
@@ -133,7 +133,7 @@ pub(crate) fn fit_with(
     let two_pi = 2.0 * std::f64::consts::PI;
     let log_mean = points.iter().map(|p| p.frequency_hz.ln()).sum::<f64>() / points.len() as f64;
     let scale = two_pi * log_mean.exp();
-    // No point weighs more than a thousandth of its own size allows: a start must not hang on one line.
+    // The start limits these weights to 1000 over a point's size, so that it does not depend on one line.
     let weights: Vec<f64> = points.iter().map(|p| (2.0 / p.variance).sqrt()).collect();
     let unscale = |x: &[f64]| -> (Vec<f64>, Vec<f64>, f64) {
         let numerator = x[..=zeros]
@@ -215,7 +215,7 @@ pub(crate) fn fit_with(
     })
 }
 
-/// The lowest of the minima that the starts lead to, of residuals that are finite at the start.
+/// The lowest minimum that the starts lead to; starts with infinite residuals are skipped.
 fn best_minimum(
     starts: impl Iterator<Item = Vec<f64>>,
     residuals: usize,
@@ -259,8 +259,8 @@ fn checked(points: &[FrequencyPoint], parameters: usize) -> Result<usize, IdentE
     Ok(parameters)
 }
 
-/// Coefficients (scaled time) of a rational function by iterated linear least squares; the hold and delay are first
-/// taken off the data approximately. `None` when the equations are singular.
+/// Coefficients (scaled time) of a rational function by iterated linear least squares; hold and delay are first removed from the
+/// data approximately. `None` when the equations are singular.
 fn sanathanan_koerner(
     points: &[FrequencyPoint],
     weights: &[f64],
@@ -333,8 +333,8 @@ pub fn fit_orders(
         }
     }
     fits.sort_by(|a, b| a.aicc.total_cmp(&b.aicc));
-    // Among fits that the criterion hardly tells apart the one with fewest parameters leads, and of those the one of lower
-    // order: a zero that is not needed trades against the delay, and so do poles.
+    // If the criterion hardly separates some fits, prefer the fewest parameters, then the lower order. Zeros and poles that are
+    // not needed trade against the delay.
     let best = fits[0].aicc;
     let size = |f: &RationalFit| (f.order + f.numerator.len(), f.order);
     let simplest = (0..fits.len())

@@ -1,4 +1,4 @@
-//! The frequency response that a sampled record shows of a continuous plant: hold, delay and exposure, exactly.
+//! The frequency response of a continuous plant as a sampled record shows it: hold, delay and exposure, exactly.
 //!
 //! Row k of a record holds the command `u_k`, applied from `t_k` on and held for one period `T`, and the position
 //! just before that command takes effect. A plant `G(s) = D + sum r_i / (s - p_i)` behind a delay `L` then has the
@@ -6,8 +6,8 @@
 //!
 //! `H(z) = z^-(n+1) [ D + sum r_i ( e^(p_i m) phi_i(T) / (z - e^(p_i T)) + phi_i(m) ) ]`,  `phi_i(t) = (e^(p_i t) - 1)/p_i`,
 //!
-//! and an exposure `Te` averages it over delays `l` in `[L - Te/2, L + Te/2]`. Nothing is approximated: at 300 Hz and
-//! 1 kHz the hold alone is worth 54 deg. Not for effects that are not linear.
+//! and an exposure `Te` averages it over delays `l` in `[L - Te/2, L + Te/2]`. Nothing is approximated: at 300 Hz, sampled at 1
+//! kHz, the hold alone gives 54 deg. Not for effects that are not linear.
 
 use nalgebra::Complex;
 
@@ -51,7 +51,7 @@ pub struct PartialFractions {
     pub terms: Vec<(Complex<f64>, Complex<f64>)>,
 }
 
-/// `e^z - 1` without loss of digits near zero.
+/// `e^z - 1`, precise near zero.
 fn complex_exp_m1(z: Complex<f64>) -> Complex<f64> {
     let half = (0.5 * z.im).sin();
     let re = z.re.exp_m1() * z.im.cos() - 2.0 * half * half;
@@ -149,7 +149,7 @@ impl PartialFractions {
     }
 }
 
-/// Whole periods in a delay; a delay a rounding error below a whole number counts as that number.
+/// Whole periods in a delay; a delay below a whole number by a rounding error counts as that number.
 fn whole_periods(periods: f64) -> f64 {
     (periods + 1e-9).floor()
 }

@@ -1,4 +1,4 @@
-//! Where the segments of an experiment lie, and what they recorded.
+//! The segments of an experiment: their ticks in the schedule, and their records.
 
 /// Segments laid end to end.
 #[derive(Debug, Clone, PartialEq)]
@@ -9,7 +9,7 @@ pub struct Schedule {
     pub spans: Vec<Span>,
 }
 
-/// Where a segment lies in a [`Schedule`].
+/// The ticks of a segment in a [`Schedule`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Span {
     /// The segment's place in the plan.
@@ -18,11 +18,11 @@ pub struct Span {
     pub start: usize,
     /// Ticks of settling, not used.
     pub settle: usize,
-    /// Ticks in all, settling included, fading out not.
+    /// Ticks in all, with settling and without fading out.
     pub rows: usize,
 }
 
-/// Mean age of the frames of all segments, s; `None` where it is not known of each.
+/// Mean age of the frames of all segments, s; `None` if one of the segments does not know it.
 pub fn common_age_s(records: &[RecordedSegment]) -> Option<f64> {
     let (mut sum, mut rows) = (0.0, 0.0);
     for record in records {
@@ -42,8 +42,8 @@ pub struct RecordedSegment {
     pub from: usize,
     /// Mean time from the middle of an exposure to the tick that used it, s, by the frames' own stamps; `None`: not known.
     pub age_s: Option<f64>,
-    /// Commanded displacement per row, um; `NaN` where there was no tick.
+    /// Commanded displacement per row, um; `NaN` in a row without a tick.
     pub input: Vec<f64>,
-    /// Bead position per row, um; `NaN` where there was none.
+    /// Bead position per row, um; `NaN` in a row without one.
     pub output: Vec<f64>,
 }

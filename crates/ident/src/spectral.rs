@@ -1,8 +1,8 @@
-//! What a foreign record was excited with, and a frequency response from records without a known excitation.
+//! Finds the excitation of a foreign record, and measures a frequency response without a known excitation.
 //!
-//! [`find_lines`] looks for sines in an input; [`welch`] estimates a response from averaged spectra (H1) where the
-//! input is broadband. H1 is biased in closed loop, where the input carries the output's noise: records with a known
-//! excitation go through [`crate::frequency_response`].
+//! [`find_lines`] looks for sines in an input; [`welch`] estimates a response from averaged spectra (H1) for a broadband input.
+//! H1 is biased in closed loop, because the input carries the output's noise. For records with a known excitation use
+//! [`crate::frequency_response`].
 
 use nalgebra::Complex;
 use realfft::RealFftPlanner;
@@ -26,8 +26,8 @@ const LEVELS: ToneFit = ToneFit {
     whitening: Whitening::Levels,
 };
 
-/// Finds at most `most` sines in `signal` by taking off the strongest again and again; stops when 99.9 % of the
-/// variance is explained or a further line would add less than 0.05 %.
+/// Finds at most `most` sines in `signal` by repeatedly removing the strongest. It stops when 99.9 % of the variance is
+/// explained, or when a further line would add less than 0.05 %.
 pub fn find_lines(signal: &[f64], period_s: f64, most: usize) -> Lines {
     let n = signal.len();
     let Some(base) = fit_block(signal, 0, n, period_s, &[], LEVELS) else {
@@ -72,7 +72,7 @@ pub fn find_lines(signal: &[f64], period_s: f64, most: usize) -> Lines {
     }
 }
 
-/// `signal` less its sines, offset and ramp; `NaN` rows become 0.
+/// `signal` minus its sines, offset and ramp; `NaN` rows become 0.
 pub fn residual_of(signal: &[f64], period_s: f64, lines: &[f64]) -> Vec<f64> {
     let n = signal.len();
     let phasors = fit_block(signal, 0, n, period_s, lines, LEVELS)
@@ -172,9 +172,9 @@ fn golden(low: f64, high: f64, cost: &impl Fn(f64) -> f64) -> f64 {
     0.5 * (a + b)
 }
 
-/// Response by averaged spectra (H1, Hann windows overlapping by half, each stretch detrended), `stretch` rows each.
-/// Points whose coherence is below `least_coherence` are left out. Increments of both signals are used when
-/// `difference` is set (an integrating plant), which leaves their ratio as it is.
+/// Response by averaged spectra (H1, Hann windows overlapping by half, each stretch detrended), `stretch` rows each. Points whose
+/// coherence is below `least_coherence` are left out. If `difference` is set (an integrating plant), increments of both signals
+/// are used; their ratio is the same.
 pub fn welch(
     input: &[f64],
     output: &[f64],
@@ -229,15 +229,15 @@ impl Sums {
         self
     }
 
-    /// Frequency of the power that input and instrument share, rad per row. A window spreads a line over some bins, and each of
-    /// them shows the response at the line, not at its own frequency.
+    /// Frequency of the power that input and instrument share, rad per row. A window spreads a line over some bins, and each bin
+    /// shows the response at the line, not at its own frequency.
     fn turn(&self) -> f64 {
         (self.later * self.ur.conj()).arg()
     }
 }
 
-/// Response from input to output by way of an instrument that the noise is not in (the input, if it is free of noise), by averaged
-/// spectra as [`welch`]. Each point has the frequency of the power that its bins hold; bins that see one line are one point.
+/// Response from input to output by averaged spectra as in [`welch`], with a noise-free instrument (the input itself if it is
+/// free of noise). Each point has the frequency of the power that its bins hold; bins that see one line are one point.
 pub fn by_reference(
     instrument: &[f64],
     input: &[f64],
@@ -249,7 +249,7 @@ pub fn by_reference(
     let rows = input.len();
     let stretch = stretch.max(16).min(rows.saturating_sub(1));
     let (bins, count) = summed(instrument, input, output, stretch);
-    // Half-overlapping Hann windows are worth about 0.53 (1 + n)/n independent stretches each, for long records.
+    // In long records each of n half-overlapping Hann windows counts as about 0.53 (1 + n)/n independent stretches.
     let independent: f64 = (0.53 * count + 0.5f64).max(1.0);
     let floor = bins.iter().map(|b| b.rr).fold(0.0, f64::max) * 1e-9;
     let width = std::f64::consts::TAU / stretch as f64;
@@ -259,7 +259,8 @@ pub fn by_reference(
         .map(|b| (b.turn(), *b))
         .filter(|(turn, _)| *turn > 1.5 * width)
         .collect();
-    // The noise bandwidth of the window is 1.5 bins: what is nearer to a stronger bin has its noise and is one point with it.
+    // The noise bandwidth of the window is 1.5 bins. A bin nearer than that to a stronger one shares its noise and joins its
+    // point.
     seen.sort_by(|a, b| b.1.rr.total_cmp(&a.1.rr));
     let mut lines: Vec<(f64, Sums)> = Vec::new();
     for (turn, bin) in seen {
@@ -275,7 +276,7 @@ pub fn by_reference(
         let of = |power: f64, cross: Complex<f64>| cross.norm_sqr() / (s.rr * power);
         let coherence = of(s.yy, s.yr).min(of(s.uu, s.ur)).min(1.0 - 1e-12);
         let response = s.yr / s.ur;
-        // The part of the output that the input does not make; in a loop that is the noise which the input answers.
+        // The part of the output that the input does not cause; in a loop, the noise that the input answers.
         let left = s.yy - 2.0 * (response.conj() * s.yu).re + response.norm_sqr() * s.uu;
         let variance = left.max(0.0) * s.rr / (s.ur.norm_sqr() * independent);
         (coherence >= least_coherence).then(|| FrequencyPoint {
@@ -295,7 +296,7 @@ pub fn by_reference(
     lines.into_iter().filter_map(|(_, s)| point(s)).collect()
 }
 
-/// The sums of every bin over the stretches without a gap, and the number of those.
+/// The sums of every bin over the stretches without a gap, and the number of such stretches.
 fn summed(r: &[f64], u: &[f64], y: &[f64], stretch: usize) -> (Vec<Sums>, f64) {
     let mut bins = vec![Sums::ZERO; stretch / 2 + 1];
     let mut count = 0.0;

@@ -1,6 +1,6 @@
-//! From measured points and a delay test to one result: judged parameters, compensated response, model, warnings.
+//! Combines measured points and a delay test into one result: judged parameters, compensated response, model, warnings.
 //!
-//! What `cellpos identify` prints, as a library call. Not for acquiring data.
+//! The result that `cellpos identify` prints, as a library call. Not for acquiring data.
 
 use std::collections::BTreeMap;
 
@@ -49,15 +49,15 @@ pub struct Identification {
     pub sampling: Sampling,
     /// The candidate orders, fitted.
     pub selection: CandidateFits,
-    /// Parameters with verdicts, and the model to go on with.
+    /// Parameters with verdicts, and the model to use.
     pub judged: Judged,
-    /// The delay test, where one was run.
+    /// The delay test, if one was run.
     pub led: Option<DelayEstimate>,
-    /// By how much LED test and phase slope contradict each other, s.
+    /// Contradiction between LED test and phase slope, s.
     pub disagreement_s: Option<f64>,
     /// The response with hold, exposure and delay taken off.
     pub compensated: Vec<CompensatedPoint>,
-    /// Localisation noise as vision stated it while the plant was measured, um RMS, where it did.
+    /// Localisation noise that vision reported while the plant was measured, um RMS, if it did.
     pub stated_noise_um: Option<f64>,
     /// What a user must know before using the model.
     pub warnings: Vec<String>,
@@ -142,8 +142,8 @@ pub fn summarise(
 
 /// Points whose frames were older or younger than on average, as frames of the average age would have shown them.
 ///
-/// More of a delay is more than a turn of the phase: what of the held command's images folds back onto a line turns by another
-/// angle. A fit of the points that are turned alone knows the plant well enough for that part.
+/// A longer delay is more than a phase shift: images of the held command that fold onto a line turn by another angle. A fit to the points
+/// with the phase shift alone describes the plant well enough for that part.
 fn of_one_delay(
     points: Vec<FrequencyPoint>,
     sampling: Sampling,
@@ -177,15 +177,15 @@ fn continued(phase_deg: f64, near: f64) -> f64 {
     phase_deg - 360.0 * ((phase_deg - near) / 360.0).round()
 }
 
-/// Recognises a stated gain that is a measured one divided by 2 pi: Eq. (5)'s `63/s`, where 63 is the gain at 1 Hz.
-/// Returns the measured over the stated gain when it lies within 12 % of 2 pi.
+/// Recognises a stated gain that is a measured one divided by 2 pi: Eq. (5)'s `63/s`, where 63 is the gain at 1 Hz. Returns measured over
+/// stated gain if it is within 12 % of 2 pi.
 pub fn literal_per_hertz(measured_per_s: f64, stated_per_s: f64) -> Option<f64> {
     let ratio = measured_per_s / stated_per_s;
     let turn = 2.0 * std::f64::consts::PI;
     ((ratio / turn - 1.0).abs() < 0.12).then_some(ratio)
 }
 
-/// Probability of residuals as large as these by the noise alone, below which they are said to be more: one false word in a thousand
+/// If noise alone makes residuals this large with a smaller probability, a warning says so: one false warning in a thousand
 /// identifications.
 const BEYOND_NOISE: f64 = 1e-3;
 

@@ -1,9 +1,9 @@
 //! Least-squares fit of sines plus polynomial drift to a record, block by block.
 //!
-//! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has separate regressors. A
-//! freely diffusing bead makes the noise a random walk: it is white in the increments, where
-//! least squares is the best linear estimate, so increments are fitted and the phasors carried back exactly
-//! (`Y = dY/(1 - e^(-jw))`). Rows without a bead (`NaN`) are left out. Not for records whose input is not periodic.
+//! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has separate regressors. The
+//! noise of a freely diffusing bead is a random walk, so its increments are white, and least squares on them is the best linear estimate.
+//! The fit uses increments and converts the phasors back exactly (`Y = dY/(1 - e^(-jw))`). Rows without a bead (`NaN`) are left out. Not
+//! for records whose input is not periodic.
 
 use nalgebra::{Complex, DMatrix, DVector};
 
@@ -146,8 +146,8 @@ pub fn fit_block(
     })
 }
 
-/// Cuts `rows` into blocks that each hold a whole number of periods of `frequency_hz` as nearly as rows allow, at
-/// least `min_periods` of them, and at most `most` blocks. Returns the blocks' borders (one more than blocks).
+/// Cuts `rows` into at most `most` blocks. Each holds a whole number of periods of `frequency_hz`, as nearly as rows allow, and at least
+/// `min_periods`. Returns the blocks' borders (one more than blocks).
 pub fn block_borders(
     from: usize,
     to: usize,

@@ -1,4 +1,4 @@
-//! The form: as requested, or the simplest one that predicts halves of the records as well as any.
+//! Chooses the form of a base model: the one requested, or the simplest that predicts unseen halves of the records as well as any other.
 
 use super::design::Data;
 use super::fit::{Found, descend, finished, most_delay, search};
@@ -8,16 +8,16 @@ use crate::error::IdentError;
 use crate::rational::roots;
 use crate::sampled::Hold;
 
-/// Rows that starts are tried on, and that the last fit sees.
+/// Most rows on which starts are tried, and most rows of the final fit.
 const ROWS_TO_START: usize = 3_000;
 const ROWS_TO_FIT: usize = 12_000;
 
-/// By what factor the error of prediction must fall for every number more that a form has.
+/// Each further number of a form must reduce the prediction error to this part of it.
 const PER_NUMBER: f64 = 0.97;
 
-/// A slowest pole that turns by less than this over the longest stretch is a pole at zero for all that the records tell.
+/// If the slowest pole times the longest stretch is below this, the records cannot tell the pole from one at zero.
 const AS_GOOD_AS_ZERO: f64 = 1.0;
-/// One that turns by more does not count.
+/// If the product is above this, the pole is certainly not at zero.
 const NEVER_ZERO: f64 = 30.0;
 
 const NO_FIT: IdentError = IdentError::NoFit {
@@ -25,15 +25,14 @@ const NO_FIT: IdentError = IdentError::NoFit {
     reason: "no start led to a finite residual",
 };
 
-/// Fits base models to records of one plant, all together; the best first.
+/// Fits base models to all records of one plant together. The best comes first.
 ///
-/// With `asked`, the model has that form (with chosen zeros if they are open). Without, the order is chosen up to
-/// `most_order`, with and without a pole at zero, with a delay where one helps, by how well a fit to the first halves of the records
-/// runs freely through the last and the other way round, every number more having to pay for itself by 3 %.
+/// With `asked`, the model has that form (with chosen zeros if they are open). Otherwise it tries orders up to `most_order`, with and
+/// without a pole at zero, and with a delay if one helps. It fits the first halves of the records, predicts the last halves by a free
+/// run, and the other way round. Each further number must lower the prediction error by 3 %.
 ///
 /// # Errors
-/// [`IdentError::Lengths`], [`IdentError::OutOfRange`] (rate, an input that is constant), [`IdentError::TooShort`],
-/// [`IdentError::NoFit`].
+/// [`IdentError::Lengths`], [`IdentError::OutOfRange`] (rate, constant input), [`IdentError::TooShort`], [`IdentError::NoFit`].
 pub fn choose(
     records: &[Series],
     rate_hz: f64,
@@ -93,7 +92,7 @@ pub fn choose(
         fit.held_out_rms = Some(trial.held_out_rms);
         fits.push(fit);
     }
-    // A number that the records do not see at all is one too many.
+    // A form with a number that the records do not determine has one number too many.
     fits.sort_by_key(|fit| !fit.is_seen());
     if fits.is_empty() {
         return Err(NO_FIT);
@@ -101,7 +100,7 @@ pub fn choose(
     Ok(fits)
 }
 
-/// The best of every order, richest numerator first, up to where more poles do not help.
+/// The best form of each order, richest numerator first; ends when more poles do not help.
 fn orders(
     few: &Data,
     many: &Data,
@@ -154,7 +153,7 @@ struct Trial {
 }
 
 impl Trial {
-    /// Fits to all rows, and to each half, which must predict the other.
+    /// Fits all rows, then each half; each half must predict the other.
     fn new(data: &Data, form: Form, start: &[f64]) -> Option<Self> {
         let longest = most_delay(data.longest);
         let found = descend(data, &form, start, longest)?;
@@ -182,20 +181,20 @@ impl Trial {
         })
     }
 
-    /// By how much the slowest pole turns over the longest stretch; nothing for a static plant.
+    /// Slowest pole (rad per row) times the rows of the longest stretch; infinite for a static plant.
     fn slowest(&self, data: &Data) -> f64 {
         let poles = roots(&data.denominator(&self.form, &self.found.theta));
         let slowest = poles.iter().map(|p| p.norm()).fold(f64::INFINITY, f64::min);
         slowest * data.longest as f64
     }
 
-    /// Numbers of the form: a pole at zero is no number, and is preferred to one that is only near it.
+    /// Free numbers of the form. A pole at zero is not one, so it is preferred to a pole near zero.
     fn size(&self) -> usize {
         self.form.free_poles() + self.form.zeros.unwrap_or(0) + usize::from(self.form.delay)
     }
 }
 
-/// The form with the least penalised prediction error; one without a parameter at its bound has priority.
+/// The form with the smallest penalised prediction error. Forms without a parameter at its bound come first.
 fn simplest(trials: &[Trial]) -> Option<&Trial> {
     let free = trials.iter().any(|t| !t.at_bound);
     let cost =
@@ -206,12 +205,12 @@ fn simplest(trials: &[Trial]) -> Option<&Trial> {
         .min_by(|a, b| cost(a).total_cmp(&cost(b)))
 }
 
-/// The chosen order with other zeros, and, where the form was left open, without a delay.
+/// The chosen order with other numbers of zeros and, if no form was requested, without a delay.
 fn variants(data: &Data, best: &Trial, asked: Option<Form>) -> Vec<Trial> {
     let order = best.form.order;
     let zeros: Vec<usize> = match asked.and_then(|form| form.zeros) {
         Some(zeros) => vec![zeros],
-        // A direct path of a plant of high order is seldom one.
+        // A direct path found in a plant of high order is rarely real.
         None => (0..=if order <= 2 { order } else { order - 1 }).collect(),
     };
     let delays: &[bool] = match asked {

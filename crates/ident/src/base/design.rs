@@ -1,4 +1,4 @@
-//! What a set of poles and a delay leave of the records, with everything linear solved for.
+//! Residual of the records for given poles and delay, with everything linear solved for.
 
 use super::form::Form;
 use super::response::{Grid, driven, free};
@@ -6,7 +6,7 @@ use super::types::Series;
 use crate::sampled::Hold;
 use nalgebra::{DMatrix, DVector};
 
-/// Slowest and fastest pole that is searched, in parts of the length of the records and of a row.
+/// Slowest and fastest pole of the search: radians over the longest stretch, and radians per row.
 const SLOWEST: f64 = 0.02;
 const FASTEST: f64 = 8.0;
 
@@ -15,7 +15,7 @@ const FASTEST: f64 = 8.0;
 struct Stretch {
     held: [Grid; 2],
     output: Vec<f64>,
-    /// Rows that count: with an output, and with its input in the record.
+    /// Rows that count: the record holds their output and the input that acts on it.
     counts: Vec<bool>,
 }
 
@@ -36,15 +36,15 @@ pub(super) struct Data {
 pub(super) struct Solved {
     /// Numerator, highest power of s first, time in rows.
     pub numerator: Vec<f64>,
-    /// What is left, row by row, over the RMS of the output.
+    /// Residual row by row, divided by the RMS of the output.
     pub residual: Vec<f64>,
     /// Slope of the output that the input does not explain, output unit per row; mean over the stretches (integrating plants).
     pub ramp: f64,
 }
 
 impl Data {
-    /// Cuts no more than `most` rows out of the records, in stretches spread over all records; the first `skipped` rows of each
-    /// give the input that a delay reaches back to.
+    /// Cuts at most `most` rows out of the records, in stretches spread over all of them. The first `skipped` rows of a stretch give only
+    /// the input, for the delay to reach back to.
     pub(super) fn new(records: &[Series], hold: Hold, most: usize, skipped: usize) -> Self {
         let all: usize = records.iter().map(|r| r.input.len()).sum();
         let share = (most as f64 / all.max(1) as f64).min(1.0);
@@ -52,7 +52,7 @@ impl Data {
         for r in records {
             let grids = [false, true].map(|direct| Grid::new(&r.input, hold, direct));
             let n = r.input.len();
-            // A long record is seen at its beginning, its middle and its end.
+            // Take stretches at the beginning, the middle and the end of a long record.
             let pieces = if share < 0.99 {
                 3.min(n / 500).max(1)
             } else {
@@ -86,9 +86,9 @@ impl Data {
         }
     }
 
-    /// The same records with the first or the last halves alone counting: the others must be predicted.
+    /// Only the first or the last half of each stretch; the fit must predict the other half.
     pub(super) fn half(&self, last: bool, delay: f64) -> Self {
-        // For these rows the delayed input is before the cut: they do not count.
+        // The delayed input of these rows is before the cut, so they do not count.
         let late = if last { delay.ceil() as usize + 1 } else { 0 };
         let cut = |s: &Stretch| {
             let n = s.output.len();
@@ -103,8 +103,8 @@ impl Data {
         Self::of(self.stretches.iter().map(cut).collect())
     }
 
-    /// Poles in `theta`: the logarithm of a real one where their number is odd, then of the two coefficients of each pair; then the
-    /// delay. Time in rows.
+    /// `theta` holds the logarithm of one real pole if their number is odd, then the logarithms of the two coefficients of each pair,
+    /// then the delay. Time in rows.
     pub(super) fn denominator(&self, form: &Form, theta: &[f64]) -> Vec<f64> {
         let (low, high) = self.log_range();
         let at = |v: f64, power: f64| (v.clamp(power * low, power * high)).exp();
@@ -138,7 +138,7 @@ impl Data {
         })
     }
 
-    /// Solves for what is linear; None where the records cannot tell it.
+    /// Solves for the linear parameters; None if the records do not determine them.
     pub(super) fn solve(
         &self,
         form: &Form,
@@ -150,7 +150,7 @@ impl Data {
         self.solve_at(form, &denominator, delay, numerator)
     }
 
-    /// As [`Data::solve`], for a denominator; a `numerator` that is given stands, and the starts alone are solved for.
+    /// As [`Data::solve`], for a given denominator. A given `numerator` is kept; only the starts are solved for.
     pub(super) fn solve_at(
         &self,
         form: &Form,
@@ -291,7 +291,7 @@ pub(super) fn times(a: &[f64], b: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Solves normal equations; unobservable parameters (a slow start next to the sensor's zero) stay zero.
+/// Solves the normal equations. Unobservable parameters (a slow start next to the sensor's zero) remain zero.
 fn solved(gram: DMatrix<f64>, right: &DVector<f64>) -> Option<DVector<f64>> {
     let scale: Vec<f64> = (0..gram.nrows())
         .map(|i| match gram[(i, i)] {

@@ -44,7 +44,7 @@ pub(super) fn descend(data: &Data, form: &Form, start: &[f64], most_delay: f64) 
         });
     }
     data.solve(form, start, None)?;
-    // A delay below nothing is its mirror image, so that the search does not end at an edge.
+    // A negative delay counts as its absolute value, so that the search does not end at an edge.
     let fill = |theta: &[f64], out: &mut [f64]| match data.solve(form, &bounded(theta), None) {
         Some(solved) => out.copy_from_slice(&solved.residual),
         None => out.fill(1.0),
@@ -106,7 +106,7 @@ fn starts(data: &Data, form: &Form, below: &[Option<Found>]) -> Vec<Vec<f64>> {
 pub(super) fn search(data: &Data, form: &Form, below: &[Option<Found>]) -> Option<Found> {
     let longest = most_delay(data.longest);
     let n = form.free_poles();
-    // Further poles are tried about the delay that the lower orders have found.
+    // Try further poles near the delay that the lower orders found.
     let known = |order: usize| Some(*below.get(order)?.as_ref()?.theta.get(order)?);
     let delays: Vec<f64> = match (form.delay, n) {
         (false, _) => Vec::new(),
@@ -134,7 +134,7 @@ pub(super) fn search(data: &Data, form: &Form, below: &[Option<Found>]) -> Optio
     }
     tried.sort_by(|a, b| a.left.total_cmp(&b.left));
     tried.truncate(3);
-    // A delay between those tried, row by row.
+    // Then scan the delay around each start.
     for found in &mut tried {
         let Some(centre) = found.theta.get(n).copied() else {
             continue;
@@ -156,7 +156,7 @@ pub(super) fn search(data: &Data, form: &Form, below: &[Option<Found>]) -> Optio
         .min_by(|a, b| a.left.total_cmp(&b.left))
 }
 
-/// By how much the correlation of a residual in time widens every interval: the square root of its correlation time in rows.
+/// Factor by which a correlated residual widens every interval: the square root of its correlation time in rows.
 fn widening(residual: &[f64]) -> f64 {
     let n = residual.len();
     let power: f64 = residual.iter().map(|e| e * e).sum();
@@ -260,7 +260,7 @@ fn deviations(
                 b[i] += step;
                 step
             }
-            // The pole at zero stays there.
+            // The pole at zero is not varied.
             i if i == m + n - 1 && form.integrating => continue,
             i if i < m + n => {
                 let step = 1e-5 * a[i - m + 1].abs().max(1e-9);

@@ -27,7 +27,7 @@ pub struct Form {
     pub integrating: bool,
 }
 
-/// What is wrong with a form as it was written.
+/// Why the text of a form is not accepted.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{text}`: {problem}; for example order=2,delay or order=2,zeros=1 or order=1,integrating or static,delay"

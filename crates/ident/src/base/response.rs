@@ -1,9 +1,9 @@
-//! The responses that a fit combines: of each power of s over the denominator to a record's input, and of each start.
+//! The responses that a fit combines: each power of s over the denominator, driven by a record's input, and the response to each start.
 
 use crate::sampled::Hold;
 use nalgebra::DMatrix;
 
-/// Steps between two rows of an input that is sampled and not held.
+/// Steps between two rows if the input is sampled and not held.
 const FINE: usize = 4;
 
 /// An input on the grid on which it is constant from step to step.
@@ -18,8 +18,8 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// The grid of an input, one value a row. A held input is its own grid; between samples of a smooth one go cubics whose slope at a sample is that of its neighbours,
-    /// or straight lines into a plant with a direct path.
+    /// The grid of an input, one value a row. A held input is its own grid. A smooth input is interpolated between samples: by cubics
+    /// whose slope at a sample comes from its neighbours, or by straight lines if the plant has a direct path.
     pub fn new(input: &[f64], hold: Hold, direct: bool) -> Self {
         if hold == Hold::ZeroOrder {
             return Self {
@@ -116,7 +116,7 @@ pub(super) fn driven(denominator: &[f64], delay: f64, grid: &Grid) -> Vec<Vec<f6
     out
 }
 
-/// Responses at the rows to a start of one in each state.
+/// Responses at the rows if one state starts at 1, for each state.
 pub(super) fn free(denominator: &[f64], rows: usize) -> Vec<Vec<f64>> {
     let n = denominator.len() - 1;
     let a = transition(denominator, 1.0).free;
@@ -136,8 +136,7 @@ struct Step {
     driven: Vec<f64>,
 }
 
-/// One step of length `h` whose input changes a `part` of the step after its beginning: responses to the later value and to the
-/// earlier one.
+/// One step of length `h` whose input changes at the fraction `part` of the step: responses to the later and to the earlier value.
 fn steps(denominator: &[f64], h: f64, part: f64) -> (Step, Vec<f64>) {
     let early = transition(denominator, part * h);
     let late = transition(denominator, (1.0 - part) * h);

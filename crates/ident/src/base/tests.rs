@@ -2,7 +2,7 @@ use super::*;
 use crate::sampled::Hold;
 use cellpos_numeric::Random;
 
-/// Steps that are held for `held` rows.
+/// Steps held for `held` rows each.
 fn steps(rows: usize, held: usize, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     let mut value = 0.0;

@@ -20,13 +20,13 @@ pub struct BaseFit {
     pub form: Form,
     /// The model; standard deviations allow for a residual that is correlated in time.
     pub model: RationalFit,
-    /// Input at which an integrating plant stands still, where the records tell it; None for a plant that does not integrate.
+    /// Input at which an integrating plant is at rest, if the records determine it; None for a plant that does not integrate.
     pub rest_input: Option<f64>,
     /// RMS of the output about its mean, output unit.
     pub output_rms: f64,
-    /// RMS of output less free run on the rows that were fitted, output unit.
+    /// RMS of output minus free run on the fitted rows, output unit.
     pub residual_rms: f64,
-    /// The same of halves of the records that a fit to the other halves predicts, output unit; None where only one form was asked for.
+    /// The same RMS on the halves that a fit to the other halves predicts, output unit; None if only one form was requested.
     pub held_out_rms: Option<f64>,
     /// Whether the plant integrates and the free run's residual is a random walk: Brownian motion or drift, not an error of the model.
     pub wanders: bool,
@@ -35,7 +35,7 @@ pub struct BaseFit {
 }
 
 impl BaseFit {
-    /// Whether the records tell every number of the model.
+    /// Whether the records determine every number of the model.
     pub(super) fn is_seen(&self) -> bool {
         let m = &self.model;
         let all = m.numerator_sd.iter().chain(&m.denominator_sd);
@@ -43,7 +43,7 @@ impl BaseFit {
     }
 }
 
-/// Least rows with an output for a model with `parameters` numbers.
+/// Fewest rows with an output for a model with `parameters` numbers.
 const ROWS_PER_PARAMETER: usize = 8;
 
 /// Refuses records that cannot be fitted.

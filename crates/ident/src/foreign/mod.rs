@@ -1,8 +1,8 @@
-//! Identification of anybody's records: input and output columns at a rate, plant unknown.
+//! Identification of records of any rig: input and output columns at a rate, plant unknown.
 //!
-//! Lines are found in the input; gain and lag are coherent with them; harmonics in the output that the input lacks are listed,
-//! because no linear model makes them. Broadband inputs go through averaged spectra.
-//! Not for naming what makes the harmonics: that is reconciliation.
+//! The search finds lines in the input, then coherent gain and lag at each. It lists harmonics of the output that the input
+//! lacks, because no linear model makes them. For a broadband input it averages spectra. Not for naming the cause of the
+//! harmonics: that is reconciliation.
 
 mod result;
 
@@ -88,7 +88,7 @@ pub fn identify(
     }
 }
 
-/// Identifies a record of a loop by way of its reference.
+/// Identifies a record of a closed loop by its reference.
 ///
 /// # Errors
 /// As [`identify`].
@@ -174,8 +174,7 @@ pub fn nothing_to_tell(
     ForeignResult::nothing(sampling, output_rms, share)
 }
 
-/// A series with its gaps bridged by straight lines: a frame that was lost now and then must not take a whole stretch of
-/// thousands with it.
+/// A series with its gaps bridged by straight lines: one lost frame must not cost a stretch of thousands of rows.
 pub fn bridged(series: &[f64]) -> Vec<f64> {
     let known: Vec<usize> = (0..series.len())
         .filter(|&k| series[k].is_finite())
@@ -198,10 +197,10 @@ pub fn bridged(series: &[f64]) -> Vec<f64> {
     bridged
 }
 
-/// The models without those that the plant cannot be: a channel with a cell in it is passive, and an unstable pole is the
-/// noise's, or the controller's. A pole that the fit puts to the right of zero by less than its error is an integrator's.
+/// Drops the models with an unstable pole: the plant is passive, so such a pole comes from noise or from the controller. A pole
+/// to the right of zero by less than its error counts as an integrator.
 fn stable(models: Vec<RationalFit>, points: &[FrequencyPoint]) -> Vec<RationalFit> {
-    // One or two lines tell gain and lag there, and no model.
+    // One or two lines give gain and lag there, but no model.
     if points.len() < 3 {
         return Vec::new();
     }

@@ -29,7 +29,7 @@ pub enum Excitation {
 pub struct LineResult {
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Coherent gain, output unit per input unit.
+    /// Gain coherent with the line, output unit per input unit.
     pub gain: f64,
     /// Half-width of its 95 % interval.
     pub gain_ci95: f64,
@@ -56,20 +56,20 @@ pub struct Harmonic {
     pub input_ratio: f64,
     /// Probability that noise alone shows this much.
     pub p_value: f64,
-    /// Whether it is beyond both noise and anything that the input holds.
+    /// Whether it exceeds both the noise and what the input's own harmonic can cause.
     pub unexplained: bool,
 }
 
-/// What the response rests on.
+/// The basis of the response.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Basis {
-    /// The input went its own way: output over input.
+    /// The input is independent of the output: output over input.
     Input,
-    /// The record is of a loop: both were projected on its reference, which the noise is not in (joint input-output).
+    /// Closed loop: input and output were projected on its noise-free reference (joint input-output method).
     Reference,
-    /// The record is of a loop without external excitation: plant and controller cannot be separated.
+    /// Closed loop without external excitation: plant and controller cannot be separated.
     Nothing {
-        /// Part of the input's change that the output's past predicts; None where it was not tested.
+        /// Part of the input's change that the output's past predicts; None if not tested.
         share: Option<f64>,
     },
 }
@@ -77,7 +77,7 @@ pub enum Basis {
 /// Results for a foreign record.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ForeignResult {
-    /// What the response rests on.
+    /// The basis of the response.
     pub basis: Basis,
     /// How it was excited.
     pub excitation: Excitation,
@@ -109,7 +109,7 @@ impl ForeignSettings {
 }
 
 impl ForeignResult {
-    /// A record from which no model follows; `share` as in [`Basis::Nothing`].
+    /// The result for a record that gives no model; `share` as in [`Basis::Nothing`].
     pub(super) fn nothing(sampling: Sampling, output_rms: f64, share: Option<f64>) -> Self {
         Self {
             basis: Basis::Nothing { share },
