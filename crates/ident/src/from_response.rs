@@ -217,7 +217,7 @@ fn fitted(points: &[Measured], form: Form, longest_s: f64) -> Result<RationalFit
         exposure_s: 0.0,
         hold: Hold::None,
     };
-    // Without its pole at zero, the rest may have more zeros than poles: it is fitted with one more pole, far away.
+    // Without the pole at zero, the rest must not have more zeros than poles.
     if zeros > poles {
         return Err(NO_FIT);
     }
