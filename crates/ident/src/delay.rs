@@ -179,8 +179,9 @@ const ENOUGH_TIMES: usize = 12;
 /// The delay from edges, as a median: edges delayed by a stall are outvoted.
 ///
 /// The dither lets a part of the edges fall into an exposure, whatever the delay, and their time is known exactly. Their median
-/// has an interval by ranks, without an assumed distribution. If they are too few, each edge gives `before - sent < L <= after -
-/// sent`, and the estimate is the value that most of these intervals share; its interval comes from resampled edges.
+/// has an interval by ranks, without an assumed distribution. If they are too few, each edge gives
+/// `before - sent < L <= after - sent`, and the estimate is the value that most of these intervals share; its interval comes from
+/// resampled edges.
 ///
 /// # Errors
 /// [`IdentError::TooShort`] below four edges.

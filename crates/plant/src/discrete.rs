@@ -1,8 +1,8 @@
 //! Exact zero-order-hold discretisation in the strictly proper form of the sampling convention.
 //!
-//! Row k of a record holds the displacement commanded from `t_k` on and the position just BEFORE that command takes
-//! effect, so `y_k = C x_k + D u_(k-1)`. Held at 1 ms the biproper Eq. (6) with `D u_k` instead has a zero at
-//! z = -19.3 and must never be inverted; the form here is minimum phase.
+//! Row k of a record holds the displacement commanded from `t_k` on and the position just BEFORE that command takes effect, so
+//! `y_k = C x_k + D u_(k-1)`. This form is minimum phase. The other form of the biproper Eq. (6), with `D u_k`, has a zero at z =
+//! -19.3 at 1 ms and must never be inverted.
 
 use crate::error::PlantError;
 use crate::modal::{Zpk, residues, separate};
@@ -24,7 +24,7 @@ struct Mode {
     real: bool,
 }
 
-/// A plant under a zero-order hold, with any delay, whole samples or not, at its input or output (the same thing).
+/// A plant under a zero-order hold, with any delay, in whole samples or not, at its input or output (which is equivalent).
 ///
 /// Input: displacement from the working point \[um\]; output: bead position \[um\]. Configuration only: the state is
 /// a [`DiscreteState`].
@@ -37,11 +37,11 @@ pub struct DiscretePlant {
     feedthrough: f64,
 }
 
-/// The state of a [`DiscretePlant`]: modes and the commands still under way.
+/// The state of a [`DiscretePlant`]: its modes, and the commands that the delay still holds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DiscreteState {
     modes: Vec<Complex<f64>>,
-    /// `u_(k-1)` first, then older ones: `whole + 1` of them.
+    /// `whole + 1` commands: `u_(k-1)` first, then older ones.
     past: Vec<f64>,
 }
 
@@ -324,7 +324,7 @@ impl DiscretePlant {
             .collect();
         let mut zeros = roots::roots(&cleaned);
         if !biproper || self.feedthrough == 0.0 {
-            // The factor z of a delay without a fraction cancels against the pole at the origin.
+            // For a delay of whole samples, the factor z cancels against the pole at the origin.
             if let Some(i) = zeros.iter().position(|z| z.norm() == 0.0) {
                 zeros.remove(i);
             }

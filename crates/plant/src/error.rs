@@ -1,4 +1,4 @@
-//! What can go wrong with a plant or a model, as values that name file, key, value and unit.
+//! Errors of a plant or a model, as values that name file, key, value and unit.
 
 /// A transfer function or a discretisation that cannot be built.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -55,7 +55,7 @@ pub enum PlantError {
     },
 }
 
-/// Where in a file something stands: 1-based line and column.
+/// A position in a file: 1-based line and column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Position {
     /// Line, from 1.
@@ -89,12 +89,12 @@ impl Position {
     }
 }
 
-/// A model that cannot be read, or that is read and refused: which file, where in it, and why.
+/// A model that cannot be read or is refused: which file, where in it, and why.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelError {
     /// The file.
     pub file: String,
-    /// Where in the file, if the problem is at a place.
+    /// Position in the file, if the problem has one.
     pub at: Option<Position>,
     /// What is wrong, and what would be right.
     pub problem: Box<ModelProblem>,
@@ -159,7 +159,7 @@ pub enum ModelProblem {
         /// The names that are known here.
         known: Vec<String>,
     },
-    /// A key that must be there is missing; the position is that of its table.
+    /// A required key is missing; the position is that of its table.
     #[error("`{key}` is missing: {what}")]
     MissingKey {
         /// The key, with the path to it.
@@ -191,7 +191,7 @@ pub enum ModelProblem {
         /// Largest value accepted.
         upper: f64,
     },
-    /// Values that are each right and together wrong.
+    /// Values that are each valid but contradict each other.
     #[error("{message}")]
     Inconsistent {
         /// What is wrong, and what would be right.
@@ -210,7 +210,7 @@ fn with_unit(value: f64, unit: &str) -> String {
     }
 }
 
-/// The words for a range, none where any finite number will do.
+/// The words for a range; empty if any finite number is allowed.
 fn range_text(lower: f64, upper: f64, unit: &str) -> String {
     if lower <= -f64::MAX && upper >= f64::MAX {
         String::new()

@@ -1,10 +1,10 @@
-//! Frames that are lost or delivered twice: what happens to whole rows of a record.
+//! Frames that are lost or delivered twice, as whole rows of a record.
 
 use crate::effects::Action;
 use crate::model::Model;
 use cellpos_numeric::Random;
 
-/// What becomes of one frame.
+/// Fate of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameFate {
     /// Recorded.

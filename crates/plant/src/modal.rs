@@ -1,4 +1,4 @@
-//! Partial-fraction (modal) form: every pole on its own, so that poles many decades apart do not disturb one another.
+//! Partial-fraction (modal) form: every pole is separate, so that poles many decades apart do not disturb one another.
 
 use crate::transfer::TransferFunction;
 use nalgebra::Complex;
@@ -109,10 +109,10 @@ impl Zpk {
     }
 }
 
-/// Poles closer to one another than this part of their size are moved apart symmetrically: the response then errs by
-/// about the square of it, while the residues of a closer pair would lose as many digits as the pair is close.
+/// Poles closer together than this part of their size are moved apart symmetrically. The error of the response is about
+/// the square of this part; the residues of a closer pair would lose as many digits as the pair is close.
 const SPLIT: f64 = 3e-5;
-/// Poles slower than this \[rad/s\] (four months) count as being at zero for the question of how close they are.
+/// Poles slower than this \[rad/s\] (four months) count as zero in the test of how close they are.
 const SLOWEST: f64 = 1e-7;
 
 /// Moves coinciding poles apart, conjugate pairs alike, keeping their mean.
@@ -145,7 +145,7 @@ pub(crate) fn separate(poles: &mut [Complex<f64>]) {
         }
         let mean: Complex<f64> =
             cluster.iter().map(|&j| poles[j]).sum::<Complex<f64>>() / cluster.len() as f64;
-        // Three or more lose digits with the square of their distance: they are moved further apart.
+        // Three or more poles lose digits with the square of their distance, so they are moved further apart.
         let distance = if cluster.len() > 2 {
             10.0 * SPLIT
         } else {

@@ -1,5 +1,5 @@
-//! [`Model`]: the plant with its working point, effects and noise; the one artifact that identify writes, the
-//! emulator runs, design reads, reconcile extends and track carries.
+//! [`Model`]: the plant with its working point, effects and noise. All commands share it: identify writes it, the emulator runs it,
+//! design reads it, reconcile extends it, and track carries it.
 
 use crate::effects::{Action, Effect, Place};
 use crate::error::{ModelError, ModelProblem};
@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::path::Path;
 
-/// Noise that is always present and no discrepancy unless its size is wrong.
+/// Noise that is always present. It is a discrepancy only if its size is wrong.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Noise {
     /// Diffusion coefficient D of the bead, um^2/s: increments over dt have the variance 2 D dt.
@@ -51,10 +51,10 @@ pub struct Model {
     pub effects: Vec<Effect>,
     /// Brownian motion and localisation noise.
     pub noise: Noise,
-    /// Delay that was measured with the plant, s: from a command to the middle of the exposure that shows it, and on to the tick that
-    /// uses it. It is not in [`Self::plant`], for it belongs to the rig; a loop's delay is this and half a period of hold.
+    /// Delay measured with the plant, s: from a command to the middle of the exposure that shows it, and on to the tick that uses it. It
+    /// belongs to the rig and is not in [`Self::plant`]. A loop's delay is this plus half a period of hold.
     pub camera_delay_s: Option<f64>,
-    /// Age of the frames when that delay was measured, s. What it leaves of the delay is the way of a command to the bead: line, board and
+    /// Age of the frames when that delay was measured, s. The rest of the delay is the path of a command to the bead: line, board and
     /// amplifier.
     pub frame_age_s: Option<f64>,
     /// Covariance of the fitted parameters, if they were fitted.
@@ -65,8 +65,8 @@ pub struct Model {
     pub provenance: BTreeMap<String, String>,
 }
 
-/// Keys of the provenance of a model whose lengths are in the units of its records: sampling of the input, and the mark of reconcile
-/// for a base that was fitted to them.
+/// Keys of the provenance of a model whose lengths are in the units of its records: the sampling of the input, and reconcile's mark for a
+/// base fitted to the records.
 const UNITS_OF_RECORDS: [&str; 2] = ["hold", Model::UNITS];
 
 /// [`Model::is_in_any_unit`] of a provenance.
@@ -79,7 +79,7 @@ impl Model {
     /// Key of the provenance with the units of a model's records, if they are not micrometres.
     pub const UNITS: &str = "units";
 
-    /// Whether lengths are in the units of the records that the model is of: bounds in micrometres do not hold for them.
+    /// Whether lengths are in the units of the model's records; bounds in micrometres then do not apply.
     pub fn is_in_any_unit(&self) -> bool {
         is_in_any_unit(&self.provenance)
     }
@@ -123,7 +123,7 @@ impl Model {
     /// A file that cannot be read, and all that [`Self::from_toml_str`] refuses.
     pub fn load_file(path: &Path) -> Result<Self, ModelError> {
         let file = path.display().to_string();
-        /// No model comes near it.
+        /// Far beyond any model.
         const MOST_BYTES: u64 = 1 << 24;
         let text = cellpos_table::read_text(path, MOST_BYTES).map_err(|error| ModelError {
             file: file.clone(),
@@ -141,8 +141,8 @@ impl Model {
 
     /// The frequency response of all that is linear: plant, linear effects, delay and exposure, from command to record.
     ///
-    /// Effects that are not linear, clock skew and what is added (drift, hum) are left out; a drifting gain and a
-    /// dissolving bubble count as at the start.
+    /// It omits nonlinear effects, clock skew and additive ones (drift, hum). A drifting gain and a dissolving bubble have their state at
+    /// the start.
     pub fn linear_response(&self, frequency: Hertz) -> Complex<f64> {
         let w = TAU * frequency.value();
         let s = Complex::new(0.0, w);
@@ -170,7 +170,7 @@ impl Model {
                     camera *= Complex::from_polar(sinc, -half);
                 }
                 Action::Bypass(zpk) => beside.push(zpk.at(s)),
-                // A block counts with its state at the start, if linear: see above.
+                // A block that is linear at its start counts with that state: see above.
                 Action::Block(_) => {
                     value *= match effect.kind().small_motion(effect, s) {
                         Some([input, position, velocity]) => input + position + velocity * s,

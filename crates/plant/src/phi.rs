@@ -41,7 +41,7 @@ pub(crate) fn phi(z: Complex<f64>) -> Phi {
     }
 }
 
-/// `exp(x)`, `phi1` and `phi2` of a real number: a block that changes from step to step asks at every step.
+/// `exp(x)`, `phi1` and `phi2` of a real number, fast: a block that changes from step to step calls it in every step.
 pub(crate) fn phi_real(x: f64) -> [f64; 3] {
     if x.abs() < 0.5 {
         // phi2 by its series sum x^k/(k+2)!, to double precision.

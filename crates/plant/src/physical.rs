@@ -1,7 +1,7 @@
 //! The paper's mechanical model, Eq. (1)-(3), and the coefficients of Eq. (4) that follow from it.
 //!
-//! Eq. (4) is checked in the tests against a numeric solution of (1)-(3). (A9) and (A10) are given as corrected: the
-//! printed (A10) has `(2 z^2 w)^2` where `(2 z w)^2` is right, and is wrong by 24.8 dB at 10 Hz.
+//! Tests check Eq. (4) against a numeric solution of (1)-(3). (A9) and (A10) are corrected here: the printed (A10) has
+//! `(2 z^2 w)^2` instead of `(2 z w)^2`, an error of 24.8 dB at 10 Hz.
 
 use crate::error::PlantError;
 use crate::transfer::TransferFunction;
@@ -18,7 +18,7 @@ pub struct PhysicalParameters {
     pub a1_m2: f64,
     /// A2, cross-section of the microchannel, m^2.
     pub a2_m2: f64,
-    /// Ac, cross-section of the virtual piston that stands for the compliant walls, m^2.
+    /// Ac, cross-section of the virtual piston that represents the compliant walls, m^2.
     pub ac_m2: f64,
     /// M, mass of the virtual piston, kg.
     pub wall_mass_kg: f64,
@@ -49,10 +49,11 @@ pub struct SecondOrder {
     pub omega2_rad_per_s: f64,
 }
 
-/// What Eq. (4)'s five coefficients leave open of the nine parameters of Eq. (1)-(3).
+/// Why the five coefficients of Eq. (4) do not determine the nine parameters of Eq. (1)-(3).
 ///
-/// Only four ratios follow from a measured transfer function. Scaling all forces (M, c, k, m, c2, k2 alike), changing
-/// Ac with m, c2, k2 so that `(Ac/A2)^2 (m, c2, k2)` stays, and changing A1 and A2 alike leave Eq. (4) as it is.
+/// Only four ratios follow from a measured transfer function. Three changes leave Eq. (4) the same: a common factor on
+/// all forces (M, c, k, m, c2, k2), a change of Ac with m, c2, k2 that keeps `(Ac/A2)^2 (m, c2, k2)`, and a common
+/// factor on A1 and A2.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum NotIdentifiable {
     /// The gain alpha is larger than the geometry allows: the fluid's mass would have to be negative.
@@ -78,7 +79,7 @@ pub enum NotIdentifiable {
     /// The channel's resistance would have to be negative.
     #[error("the coefficients give the channel a negative resistance c2")]
     NegativeDamping,
-    /// A geometry or mass given is not positive.
+    /// A given area or mass is not positive.
     #[error("{name} = {value} {unit}: it must be positive and finite")]
     NotPositive {
         /// The quantity.
@@ -114,7 +115,7 @@ impl PhysicalParameters {
         }
     }
 
-    /// Eq. (A4), the transfer function without going through damping ratios (which do not exist for k2 = k = 0).
+    /// Eq. (A4), the transfer function without damping ratios, which do not exist for k2 = k = 0.
     ///
     /// # Errors
     /// Parameters that make no plant, for example a wall without mass, damping and stiffness.
@@ -159,7 +160,7 @@ impl PhysicalParameters {
             + s * self.channel_damping_n_s_per_m
             + self.outlet_stiffness_n_per_m;
         let real = |v: f64| Complex::new(v, 0.0);
-        // Unknowns scaled by their areas (volumes Ac Xc and A2 X2), which brings the rows to one order of magnitude.
+        // The unknowns are volumes (Ac Xc and A2 X2), so that the rows have one order of magnitude.
         let compliance_wall = wall / (self.ac_m2 * self.ac_m2);
         let compliance_channel = channel / (self.a2_m2 * self.a2_m2);
         let scale = compliance_wall.norm().max(compliance_channel.norm());
@@ -182,8 +183,8 @@ impl PhysicalParameters {
         Some(solution[1] / self.a2_m2)
     }
 
-    /// The parameters that have given coefficients, once the geometry and the wall's mass are given: those five
-    /// coefficients leave A1, A2, Ac and one force scale (here M) open. See [`NotIdentifiable`].
+    /// The parameters that produce these coefficients, for a given geometry and wall mass. The five coefficients do not
+    /// determine A1, A2, Ac and one force scale (here M): see [`NotIdentifiable`].
     ///
     /// # Errors
     /// Areas or a mass that are not positive, and coefficients that no passive rig of this geometry has.
@@ -210,7 +211,7 @@ impl PhysicalParameters {
         let c = coefficients;
         let area_ratio = a1_m2 / a2_m2;
         let r = (ac_m2 / a2_m2).powi(2);
-        // Rounding may bring the three differences a little below zero where the truth is zero.
+        // Rounding may make a difference slightly negative if the true value is zero.
         let slack = |difference: f64, of: f64| {
             if difference.abs() < 1e-12 * of.abs() {
                 0.0
@@ -256,8 +257,8 @@ impl PhysicalParameters {
 }
 
 impl SecondOrder {
-    /// The coefficients that the paper lists with Eq. (6). They are rounded: `2 z1 w1` is 20343 where Eq. (6) has
-    /// 20261.5, `2 z2 w2` 75.46 where it has 76.3. Use [`TransferFunction::eq6`].
+    /// The coefficients that the paper lists with Eq. (6). They are rounded: `2 z1 w1` is 20343 (20261.5 in Eq. (6)),
+    /// `2 z2 w2` is 75.46 (76.3 in Eq. (6)). Use [`TransferFunction::eq6`].
     pub const PAPER_ROUNDED: Self = Self {
         alpha: 0.01872,
         zeta1: 7.7,
@@ -266,8 +267,8 @@ impl SecondOrder {
         omega2_rad_per_s: 0.36,
     };
 
-    /// The coefficients of a second-order biproper transfer function; `None` for another shape, or where `w1` or `w2`
-    /// is not real and positive.
+    /// The coefficients of a second-order biproper transfer function; `None` for another shape, or if `w1` or `w2` is
+    /// not real and positive.
     pub fn from_transfer_function(g: &TransferFunction) -> Option<Self> {
         let ([b2, b1, b0], [a2, a1, a0]) = (g.num(), g.den()) else {
             return None;

@@ -1,7 +1,7 @@
 //! Quantities with units in TOML files (`park = "20um"`), or as bare numbers with the unit in the key (`park_um = 20.0`).
 //!
-//! The text is rewritten to bare numbers before it is read, line for line, so that every later message names the right line.
-//! Which keys of a file are quantities its owner says ([`Quantity`]); everything else is left as it stands.
+//! The text is first rewritten to bare numbers, line for line, so that every later message names the right line. The caller says
+//! which keys are quantities ([`Quantity`]); the rest of the text is not changed.
 
 use cellpos_numeric::units::{Degrees, Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use std::ops::Range;
@@ -45,7 +45,7 @@ pub struct QuantityError {
     pub with_unit: &'static str,
 }
 
-/// The text with bare numbers; what is no TOML comes back as it is, for the reader to say so.
+/// The text with bare numbers. Text that is not TOML comes back unchanged; its reader reports the error.
 ///
 /// ```
 /// use cellpos_plant::quantities::{Quantity, bare};
@@ -56,7 +56,7 @@ pub struct QuantityError {
 /// ```
 ///
 /// # Errors
-/// [`QuantityError`] for the first value that is no quantity of the kind that its key asks for.
+/// [`QuantityError`] for the first value that is not a quantity of the kind that its key needs.
 pub fn bare(text: &str, quantities: &[Quantity]) -> Result<String, QuantityError> {
     let Ok(document) = DeTable::parse(text) else {
         return Ok(text.to_string());
@@ -147,7 +147,7 @@ fn number(key: &str, quantity: &str) -> Result<String, String> {
         "ms" => of::<Seconds>(quantity)?.0 * 1e3,
         _ => of::<Seconds>(quantity)?.0,
     };
-    // Decimal units leave a rounding error in the last digits; whole numbers suit keys that take nothing else.
+    // Decimal units leave a rounding error in the last digits; keys of integers need a whole number.
     let value = (value * 1e9).round() / 1e9;
     Ok(if value.fract() == 0.0 && value.abs() < 1e15 {
         format!("{value:.0}")
@@ -212,7 +212,7 @@ mod tests {
         assert_eq!(error.to_string(), "near = 3: has no unit: write \"3um\"");
         let error = bare("[limits]\nslew = 2\n", &SOME).expect_err("refused");
         assert!(error.problem.ends_with("\"2um/s\""), "{error}");
-        // The same word in another table is another key.
+        // The same word in another table is a different key.
         assert!(bare("[board]\nnear = 3\n", &SOME).is_ok());
     }
 }

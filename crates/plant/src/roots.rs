@@ -1,4 +1,4 @@
-//! Roots of real polynomials whose roots may lie many decades apart. Not for degrees beyond about 30.
+//! Roots of real polynomials; the roots may be many decades apart. Not for degrees beyond about 30.
 
 use nalgebra::Complex;
 
@@ -23,8 +23,8 @@ pub(crate) fn multiply(a: &[f64], b: &[f64]) -> Vec<f64> {
     product
 }
 
-/// The roots of a real polynomial given from the highest power down: real roots have an imaginary part of exactly
-/// zero, complex ones come in exactly conjugate pairs, sorted by magnitude.
+/// The roots of a real polynomial given from the highest power down, sorted by magnitude. Real roots have an imaginary
+/// part of exactly zero; complex ones come in exactly conjugate pairs.
 ///
 /// Degree one and two in closed form without cancellation; above, Aberth's simultaneous iteration started from the
 /// polynomial's Newton polygon (Bini 1996), which finds roots many decades apart.

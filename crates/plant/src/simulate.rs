@@ -1,7 +1,7 @@
-//! What the camera records of a [`Chain`]: delay, exposure, clock, hum, pixel locking and localisation noise.
+//! The camera's record of a [`Chain`]: delay, exposure, clock, hum, pixel locking and localisation noise.
 //!
-//! Delay and exposure are exact: the chain is stopped at the very instants that a frame sees, and the exposure is the
-//! integral of the position in closed form. Nothing is interpolated.
+//! Delay and exposure are exact, without interpolation: the chain stops at the instants that a frame sees, and the exposure is
+//! the integral of the position in closed form.
 
 mod camera;
 
@@ -9,7 +9,7 @@ use crate::chain::{Chain, ChainError, in_range};
 use crate::model::Model;
 use camera::Camera;
 
-/// On which side of the command a row's position is taken, where the two coincide.
+/// Whether a row's position is taken before or after a command at the same instant.
 ///
 /// Eq. (6) is biproper: the bead jumps by 0.01872 um per um of a command's step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -17,14 +17,14 @@ pub enum Sampled {
     /// Just before the row's command takes effect, `y_k = C x_k + D u_(k-1)`: the convention of records.
     #[default]
     BeforeCommand,
-    /// Just after, `y_k = C x_k + D u_k`: as simulators that evaluate the output with the present input write it.
+    /// Just after, `y_k = C x_k + D u_k`: as in simulators that evaluate the output with the present input.
     AfterCommand,
 }
 
 /// How to simulate.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SimulateOptions {
-    /// On which side of a row's command its position is taken.
+    /// Whether a row's position is taken before or after its command.
     pub sampled: Sampled,
     /// With a seed: Brownian motion and localisation noise. Without: the noise-free response.
     pub seed: Option<u64>,
@@ -107,7 +107,7 @@ struct Note {
 }
 
 impl Note {
-    /// At an instant before the start (or at it), where everything rests.
+    /// Note of an instant at or before the start, when everything is at rest.
     fn before(rest_um: f64, at_s: f64) -> Self {
         Self {
             bead_um: rest_um,
@@ -118,8 +118,8 @@ impl Note {
 
 /// A chain with its camera at a fixed sample time, row by row: for closed loops without frames, and for records.
 ///
-/// For each row: [`Simulator::measure`], then [`Simulator::hold`]. Neither allocates. The clock-skew effect needs
-/// positions that a running loop does not have yet; it acts in [`simulate`] only.
+/// For each row: [`Simulator::measure`], then [`Simulator::hold`]. Neither allocates. The clock-skew effect needs positions that
+/// a running loop does not have yet, so it acts only in [`simulate`].
 #[derive(Debug, Clone)]
 pub struct Simulator {
     chain: Chain,
@@ -170,7 +170,7 @@ impl Simulator {
         Ok(simulator)
     }
 
-    /// What the first rows see of the time before the record.
+    /// The notes of the time before the record, for the first rows.
     fn note_rest(&mut self) {
         let rest_um = self.chain.bead_um();
         for (ring, exposure_s) in [
@@ -193,7 +193,7 @@ impl Simulator {
 
     /// The position recorded in the present row, um, just before the row's command. To be called once per row.
     pub fn measure(&mut self) -> f64 {
-        // The ring holds intervals row-whole-1 .. row-1; the oldest is the one wanted.
+        // The ring holds intervals row-whole-1 .. row-1; this row needs the oldest.
         let oldest = |ring: &[Note], row: usize| {
             ring.get(row % ring.len().max(1))
                 .copied()
@@ -247,7 +247,7 @@ impl Simulator {
     /// The row's position taken just after its command, as [`Sampled::AfterCommand`] wants it, and the command held.
     fn row_after(&mut self, command_um: f64) -> f64 {
         self.chain.advance(command_um, 0.0);
-        // Only an instant that coincides with a row's time sees the difference.
+        // The side matters only for an instant that coincides with a row's time.
         let late = self.end.part_s == 0.0;
         let now = self.note();
         let n = self.ends.len();
@@ -276,7 +276,7 @@ impl Simulator {
         y
     }
 
-    /// Restarts at rest at the working point, at row 0. The random numbers go on.
+    /// Restarts at rest at the working point, at row 0. The random numbers are not restarted.
     pub fn reset(&mut self) {
         self.chain.reset();
         self.note_rest();
@@ -310,8 +310,8 @@ impl Simulator {
 
 /// The bead positions \[um\] that a model records in answer to displacements \[um\] held for `sample_s` each.
 ///
-/// Row k of the answer belongs to row k of `pzt_um`. The rig rests at the working point before row 0 with the bead at
-/// 0 um, or where equations in the plant's place begin. Frames are neither dropped nor repeated here: see [`crate::frame_fates`].
+/// Row k of the answer belongs to row k of `pzt_um`. Before row 0 the rig is at rest at the working point, with the bead at 0 um
+/// or where equations that replace the plant begin. Frames are neither dropped nor repeated here: see [`crate::frame_fates`].
 ///
 /// # Errors
 /// A model with numbers out of range, a sample time outside 0.1 us..1e5 s, displacements that are not finite.
@@ -335,8 +335,8 @@ pub fn simulate(
     Ok(bead_um)
 }
 
-/// As [`simulate`] for rows at any rising times \[s\], as they are in a record with missing rows: a row's displacement
-/// is held until the next row there is. The first row's time is the start.
+/// As [`simulate`], for rows at any rising times \[s\], for example a record with missing rows. Each displacement is held until
+/// the next existing row. The first row's time is the start.
 ///
 /// # Errors
 /// As [`simulate`], and times that do not rise.
@@ -374,7 +374,7 @@ pub fn simulate_at(
 /// Instants nearer than this to a command, s, coincide with it.
 const COINCIDENT_S: f64 = 1e-9;
 
-/// Rows at any times, with clock skew: the chain is stopped at every instant that a frame sees.
+/// Rows at any times, with clock skew: the chain stops at every instant that a frame sees.
 fn irregular(
     simulator: Simulator,
     time_s: &[f64],

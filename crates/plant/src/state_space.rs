@@ -37,7 +37,7 @@ impl StateSpace {
                 continue;
             }
             let scale = r.norm().sqrt().max(f64::MIN_POSITIVE);
-            // Of a pair that rounding has torn apart one pole is left: it has no room for an imaginary part.
+            // If rounding has split a pair, one pole is left over; a single row has no room for its imaginary part.
             if p.im == 0.0 || row + 1 == n {
                 a[(row, row)] = p.re;
                 b[row] = scale;

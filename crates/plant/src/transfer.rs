@@ -12,8 +12,8 @@ pub const MAX_ORDER: usize = 12;
 
 /// A rational transfer function with real coefficients, from PZT displacement \[um\] to bead position \[um\].
 ///
-/// Coefficients stand from the highest power of s \[rad/s\] down. The numerator's degree is at most the
-/// denominator's: a static gain, a strictly proper and a biproper function are all allowed.
+/// Coefficients run from the highest power of s \[rad/s\] down. The numerator's degree is at most the denominator's: a
+/// static gain, a strictly proper and a biproper function are all allowed.
 ///
 /// ```
 /// use cellpos_plant::{Hertz, TransferFunction};
@@ -55,9 +55,8 @@ impl TransferFunction {
     /// A transfer function from its coefficients, highest power of s \[rad/s\] first. Leading zeros are dropped.
     ///
     /// # Errors
-    /// Coefficients that are not finite, polynomials without a coefficient other than zero (a numerator of zero is
-    /// refused as well: such a plant cannot be moved), a numerator of higher degree than the denominator, and more
-    /// than [`MAX_ORDER`] poles.
+    /// Coefficients that are not finite, a denominator or numerator of zeros only (such a plant cannot be moved), a
+    /// numerator of higher degree than the denominator, and more than [`MAX_ORDER`] poles.
     pub fn new(num: Vec<f64>, den: Vec<f64>) -> Result<Self, PlantError> {
         let num = trimmed("num", num)?;
         let den = trimmed("den", den)?;

@@ -1,4 +1,4 @@
-//! Messages of the TOML reader in the words of people.
+//! Messages of the TOML reader in plain words.
 
 /// A message of serde in plain words: a reader of a TOML file need not know Rust types.
 pub fn in_words(message: &str) -> String {

@@ -14,7 +14,7 @@ pub(crate) enum Stage {
     Tied(Box<TiedPlant>),
 }
 
-/// The compiled chain without its state of the front (saturation, slew).
+/// The compiled chain without the state of its front end (saturation, slew).
 #[derive(Debug, Clone)]
 pub(crate) struct Compiled {
     pub stages: Vec<Stage>,
@@ -33,15 +33,15 @@ pub(crate) struct Compiled {
     pub needs_slopes: bool,
 }
 
-/// What is between the command and the bead, collected stage by stage.
+/// Collects, stage by stage, everything between the command and the bead.
 struct Builder {
     stages: Vec<Stage>,
     /// The linear blocks since the last stage.
     pending: Zpk,
-    /// The pending blocks up to the end of the PZT, once that place is passed.
+    /// The pending blocks up to the end of the PZT; set once the chain has passed that place.
     tap: Option<Zpk>,
     plant: usize,
-    /// Whether the signal so far can be other than constant while the command is.
+    /// Whether the signal so far can change while the command is constant.
     moving: bool,
     fastest: f64,
     substep_s: f64,
@@ -51,7 +51,7 @@ struct Builder {
 /// Shortest and longest sub-step, s.
 const SHORTEST_S: f64 = 2e-5;
 const LONGEST_S: f64 = 2.5e-4;
-/// Sub-steps are this part of the fastest time constant before the block that needs them.
+/// Length of sub-steps, as a part of the fastest time constant before the block that needs them.
 const PART_OF_TIME_CONSTANT: f64 = 0.25;
 
 impl Builder {
@@ -152,7 +152,7 @@ pub(crate) fn compile(model: &Model) -> Compiled {
                 builder.moving = true;
             }
             Action::Block(block) => builder.push(block),
-            // The camera's part: see the simulator. What is tied to the plant went in with it.
+            // The camera's effects are in the simulator. Effects tied to the plant are in the plant's stage.
             Action::Around(_)
             | Action::Bypass(_)
             | Action::Delay(_)

@@ -5,7 +5,7 @@ use crate::modal::{Zpk, residues, separate};
 use crate::phi::phi;
 use nalgebra::Complex;
 
-/// What one mode does over a piece of one length.
+/// Propagator of one mode over a piece of one length.
 #[derive(Debug, Clone, Copy)]
 struct Step<T> {
     decay: T,
@@ -37,7 +37,7 @@ struct Slot {
     complex: Vec<Step<Complex<f64>>>,
 }
 
-/// Lengths kept at a time: a sample, its pieces about delay and exposure, and sub-steps.
+/// Number of lengths with kept propagators: a sample, its pieces around delay and exposure, and sub-steps.
 const SLOTS: usize = 6;
 
 /// Modes in partial-fraction form with an output and, part of the way through, the tap of the PZT displacement.
@@ -57,7 +57,7 @@ pub(crate) struct LinearGroup {
 }
 
 impl LinearGroup {
-    /// A group from its zeros, poles and gain; `tap` is the leading part of it whose output is the PZT displacement.
+    /// A group from its zeros, poles and gain; `tap` is its leading part, whose output is the PZT displacement.
     pub(crate) fn new(mut whole: Zpk, tap: Option<&Zpk>) -> Self {
         separate(&mut whole.poles);
         let (direct, weights) = residues(&whole);
@@ -65,7 +65,7 @@ impl LinearGroup {
             None => (0.0, Vec::new()),
             Some(tap) => residues(&Zpk {
                 zeros: tap.zeros.clone(),
-                // The leading poles of the whole, as they stand after coinciding ones were moved apart.
+                // The leading poles of the whole, after coinciding poles were moved apart.
                 poles: whole.poles[..tap.poles.len()].to_vec(),
                 gain: tap.gain,
             }),
@@ -167,7 +167,7 @@ impl LinearGroup {
         sum
     }
 
-    /// Position and slope with an input that jumps to this value now.
+    /// Position and slope if the input jumps to this value now.
     pub(crate) fn at_input(&self, input: f64) -> (f64, f64) {
         (
             self.state_output() + self.direct * input,
@@ -175,7 +175,7 @@ impl LinearGroup {
         )
     }
 
-    /// Position and slope `h_s` later, were this input held. Changes no state.
+    /// Position and slope `h_s` later if this input is held. Changes no state.
     pub(crate) fn ahead(&mut self, h_s: f64, input: f64) -> (f64, f64) {
         let index = self.slot(h_s);
         let (mut position, mut speed) = (self.direct * input, self.weight_sum * input);

@@ -1,9 +1,8 @@
 //! [`Chain`]: a model as a time-stepping machine, from the command to the bead.
 //!
-//! Between two changes of the command the linear part is propagated exactly, whatever the length of the step: the
-//! plant's far zero, a driver lag and a resonance need no small steps. Hysteresis and backlash on a held command are
-//! exact as well. If a nonlinear block follows one with dynamics (a driver lag before hysteresis, the plant before wall
-//! adhesion), the fastest time constant before it sets the sub-steps.
+//! Between two changes of the command the linear part is exact for any length of step, so the plant's far zero, a driver lag and a
+//! resonance need no small steps. Hysteresis and backlash on a held command are exact as well. If a nonlinear block follows one with
+//! dynamics (a driver lag before hysteresis, the plant before wall adhesion), the fastest time constant before it sets the sub-steps.
 //!
 //! Not here: the camera (see [`crate::Simulator`]).
 
@@ -37,7 +36,7 @@ pub enum ChainError {
         /// Upper bound.
         upper: f64,
     },
-    /// An effect that can act only once stands twice in the model.
+    /// The model contains an effect twice that can act only once.
     #[error("{id} stands twice in the model: it can act only once")]
     Repeated {
         /// The effect.
@@ -86,7 +85,7 @@ pub struct Chain {
     time_s: f64,
     command_um: f64,
     driver_um: f64,
-    /// Displacement that acts on the flow beside the PZT's, um.
+    /// Displacement that acts on the flow in addition to the PZT's, um.
     beside_um: f64,
     output: Piece,
     offset_um: f64,
@@ -166,8 +165,8 @@ impl Chain {
         self.wants_area = true;
     }
 
-    /// Back to rest at the working point at time 0, the bead at 0 um (or where equations in the plant's place begin). The random
-    /// numbers go on.
+    /// Returns to rest at the working point at time 0, with the bead at 0 um, or where equations that replace the plant begin. The random
+    /// numbers are not restarted.
     pub fn reset(&mut self) {
         for stage in &mut self.compiled.stages {
             match stage {
@@ -189,7 +188,7 @@ impl Chain {
         self.rest();
     }
 
-    /// Shows the start of equations that replace the plant: a level other than 0 exists before the first command.
+    /// Applies the initial level of equations that replace the plant: if it is not 0, it exists before the first command.
     fn rest(&mut self) {
         let begins = |s: &Stage| matches!(s, Stage::Tied(tied) if tied.replaces_output());
         if self.compiled.stages.iter().any(begins) {
@@ -199,8 +198,8 @@ impl Chain {
 
     /// Holds a command \[um of PZT displacement, absolute\] for `dt_s`.
     ///
-    /// `dt_s = 0` lets the command take effect without letting time pass: the bead then stands just after its jump.
-    /// A command or a time that is not finite, and a negative time, are ignored: the last command is held.
+    /// `dt_s = 0` applies the command while no time passes: the bead is then just after its jump. A command or time that is not finite
+    /// and a negative time are ignored: the last command is held.
     pub fn advance(&mut self, command_um: f64, dt_s: f64) {
         if command_um.is_finite() {
             self.command_um = command_um - self.working_point_um;
@@ -215,8 +214,7 @@ impl Chain {
         let way = target - self.driver_um;
         let reach_s = way.abs() / self.compiled.rate;
         if reach_s > 0.0 && dt_s > 0.0 {
-            // The ramp up to the target, or as far as the time allows, and then the rest at the target: no corner
-            // falls within a piece.
+            // First the ramp to the target, or as far as the time allows, then rest at the target. So no piece contains a corner.
             let ramp_s = reach_s.min(dt_s);
             let end = if reach_s <= dt_s {
                 target
@@ -236,9 +234,9 @@ impl Chain {
         }
     }
 
-    /// Sets what acts on the flow beside the PZT, as the displacement of the PZT with the same effect \[um\], from now on: pressure of
-    /// a second actuator, or reservoirs whose heights differ. It enters the chip and neither the driver nor the PZT. A value that is not
-    /// finite is ignored.
+    /// Sets a further cause of flow from now on: the pressure of a second actuator, or reservoirs whose heights differ. The value is the
+    /// PZT displacement with the same effect \[um\]. It enters the chip, but neither driver nor PZT. A value that is not finite is
+    /// ignored.
     ///
     /// ```
     /// use cellpos_plant::{Chain, Model};
@@ -331,8 +329,7 @@ impl Chain {
         self.area_um_s
     }
 
-    /// The displacement that the PZT has really reached, um, absolute: after driver, hysteresis, creep, resonance and
-    /// backlash.
+    /// The displacement that the PZT has reached, um, absolute: after driver, hysteresis, creep, resonance and backlash.
     pub fn pzt_um(&self) -> f64 {
         let reached = match self.compiled.stages.get(self.compiled.plant) {
             Some(Stage::Linear(group)) => group.tapped() - self.beside_um,
@@ -341,7 +338,7 @@ impl Chain {
         self.working_point_um + reached
     }
 
-    /// The displacement that the driver asks of the PZT after saturation and slew limit, um, absolute.
+    /// The displacement that the driver demands from the PZT after saturation and slew limit, um, absolute.
     pub fn driver_um(&self) -> f64 {
         self.working_point_um + self.driver_um
     }
@@ -359,7 +356,7 @@ impl Chain {
         speed
     }
 
-    /// Puts the bead somewhere else, um: another bead is chosen, or the origin is moved.
+    /// Sets the bead's position, um: another bead is chosen, or the origin is moved.
     pub fn place_bead(&mut self, bead_um: f64) {
         self.offset_um += bead_um - self.bead_um();
     }

@@ -1,15 +1,14 @@
-//! [`TiedPlant`]: the plant with what is tied to it, feedback of its position and equations in its stead.
+//! [`TiedPlant`]: the plant with the effects tied to it: feedback of its position, and equations that replace it.
 
 use super::linear::LinearGroup;
 use crate::effects::{Around, Piece, Seen};
 use crate::modal::Zpk;
 
-/// A plant with effects that see its input and its position: its input may depend on its position.
+/// A plant with effects that see its input and position. Its input may depend on its position.
 ///
-/// Between two steps the input is a straight line from its value at the beginning to the expected one at the end, and the plant's
-/// answer to it is exact. So the error is second order in the step, whatever the plant's poles. [`Self::longest_s`] keeps the
-/// step
-/// to a fifth of the fastest time constant.
+/// Within a step the input is a straight line from its value at the beginning to the value expected at the end. The plant's
+/// response to that line is exact, so the error is second order in the step, whatever the plant's poles. [`Self::longest_s`]
+/// keeps the step to a fifth of the fastest time constant.
 #[derive(Debug, Clone)]
 pub struct TiedPlant {
     plant: LinearGroup,
@@ -24,11 +23,11 @@ pub struct TiedPlant {
 const PART_OF_TIME_CONSTANT: f64 = 0.2;
 const SHORTEST_S: f64 = 2e-5;
 
-/// A plant with a direct path has its position in what enters it at once: so often is that put right.
+/// With a direct path the position acts on the plant's input at once: number of iterations that solve this loop.
 const ROUNDS: usize = 3;
 
 impl TiedPlant {
-    /// A plant at rest with what is tied to it, in the order in which it acts.
+    /// A plant at rest with its tied effects, in the order in which they act.
     pub fn new(plant: &Zpk, ties: Vec<Box<dyn Around>>) -> Self {
         let plant = LinearGroup::new(plant.clone(), None);
         let wanted = PART_OF_TIME_CONSTANT / plant.fastest().max(1e-6);
@@ -148,7 +147,7 @@ impl TiedPlant {
         Piece::line(start, end, h_s)
     }
 
-    /// What is seen of a position.
+    /// The position as it is seen after the effects that replace it.
     fn shown(&mut self, seen: &Seen, position: f64) -> f64 {
         let mut shown = position;
         for tie in self.ties.iter_mut().filter(|t| t.replaces_output()) {

@@ -1,4 +1,4 @@
-//! What an effect does, in the few ways in which anything can act on a signal of the chain.
+//! The few ways in which an effect can act on a signal of the chain.
 
 use super::user::Seen;
 use crate::modal::Zpk;
@@ -20,7 +20,7 @@ pub enum Action {
     Slew(f64),
     /// Anything else between command and bead.
     Block(Box<dyn Block>),
-    /// Tied to the plant: changes its input, knowing its position, or replaces its output.
+    /// Tied to the plant: changes its input with knowledge of its position, or replaces its output.
     Around(Box<dyn Around>),
     /// Another path from the PZT's displacement to the record, parallel to the plant.
     Bypass(Zpk),
@@ -80,23 +80,23 @@ pub trait Block: fmt::Debug + Send + Sync {
     /// A copy with its state.
     fn duplicate(&self) -> Box<dyn Block>;
 
-    /// Whether slopes and integrals of the input are used, not its ends alone.
+    /// Whether it uses slopes and integrals of the input, not only the ends.
     fn needs_slopes(&self) -> bool {
         false
     }
 
-    /// Whether the output bends where the input is straight, so that a moving input is taken in short pieces.
+    /// Whether a straight input can give a curved output: a moving input is then advanced in short pieces.
     fn bends(&self) -> bool {
         true
     }
 
-    /// The slope of the output for a slope of the input \[um/s\]; for blocks that stop nothing.
+    /// The slope of the output for a slope of the input \[um/s\]; for blocks that never stop the motion.
     fn speed(&self, time_s: f64, input_um_per_s: f64) -> f64 {
         let _ = time_s;
         input_um_per_s
     }
 
-    /// Starts the random numbers of a block that has any; without a seed it does nothing at random.
+    /// Seeds the random numbers of a block that has any; without a seed nothing is random.
     fn seed(&mut self, seed: u64) {
         let _ = seed;
     }
@@ -110,19 +110,19 @@ impl Clone for Box<dyn Block> {
 
 /// An effect that is tied to the plant. No allocation, no panic.
 pub trait Around: fmt::Debug + Send + Sync {
-    /// Whether its output is taken for the plant's; else it is what enters the plant.
+    /// Whether its output replaces the plant's output; else it replaces the plant's input.
     fn replaces_output(&self) -> bool;
 
-    /// Longest step of its equations \[s\], where it needs one other than the plant's poles do.
+    /// Longest step of its equations \[s\], if it differs from the one that the plant's poles need.
     fn longest_s(&self) -> Option<f64>;
 
     /// Its output now, remembered as the last.
     fn give(&mut self, seen: &Seen) -> f64;
 
-    /// Its output expected `h_s` later, nothing remembered.
+    /// Its output expected `h_s` later. Remembers nothing.
     fn ahead(&self, h_s: f64, now: &Seen, then: &Seen) -> f64;
 
-    /// Its states go on over a piece.
+    /// Advances its states over a piece.
     fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen);
 
     /// Back to rest.
@@ -138,7 +138,7 @@ impl Clone for Box<dyn Around> {
     }
 }
 
-/// What camera, light and table make of a position.
+/// The position as camera, light and table show it.
 pub trait Shown: fmt::Debug + Send + Sync {
     /// The position shown for one seen at `time_s` \[um\].
     fn show(&mut self, seen_um: f64, time_s: f64) -> f64;
@@ -146,12 +146,12 @@ pub trait Shown: fmt::Debug + Send + Sync {
     /// A copy with its state.
     fn duplicate(&self) -> Box<dyn Shown>;
 
-    /// Whether the same position is always shown alike, so that a search can take it for a part of the model.
+    /// Whether the same position always gives the same record, so that a search can use it as a part of the model.
     fn is_static(&self) -> bool {
         false
     }
 
-    /// Starts the random numbers of a block that has any; without a seed it does nothing at random.
+    /// Seeds the random numbers of a block that has any; without a seed nothing is random.
     fn seed(&mut self, seed: u64) {
         let _ = seed;
     }

@@ -37,7 +37,7 @@ static SPEC: Spec = Spec {
     separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
 };
 
-/// What tells a bubble from a lag of the driver.
+/// The experiment that distinguishes a bubble from a lag of the driver.
 pub(super) const FROM_DRIVER_LAG: &str = "a lag of the driver and a bubble in the chip give the same response from command to bead: measure the piezo itself (strain gauge or capacitive sensor) with the fluid disconnected, or repeat after an hour: a bubble's lag drifts as it dissolves";
 
 impl EffectKind for Bubble {
@@ -95,7 +95,7 @@ impl EffectKind for Bubble {
     }
 
     fn start_of_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
-        // Where nothing dissolves the two forms are one.
+        // If nothing dissolves, the two forms are the same.
         (index == 1).then(|| vec![lag_s, 0.0])
     }
 

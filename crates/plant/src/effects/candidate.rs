@@ -1,4 +1,4 @@
-//! How a search may try an effect: its free numbers, where to start, and what is usual.
+//! How a search may try an effect: its free numbers, their starts, and the usual range.
 
 /// A free number of a candidate as the fit sees it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -7,9 +7,9 @@ pub struct FitParameter {
     pub name: &'static str,
     /// Fitted as a logarithm.
     pub log: bool,
-    /// Smallest value that is looked for: smaller has no meaning, or no effect that matters.
+    /// Smallest value of the search: a smaller one has no meaning or no relevant effect.
     pub lower: f64,
-    /// Largest value that is looked for.
+    /// Largest value of the search.
     pub upper: f64,
     /// Step of the numeric derivative in the fit's coordinate.
     pub step: f64,
@@ -54,7 +54,7 @@ impl FitParameter {
 /// Ranges of starting values that the records allow.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scope {
-    /// Displacement about which the plant acts \[um\].
+    /// Working point: displacement about which the plant acts \[um\].
     pub working_point_um: f64,
     /// Smallest command \[um\].
     pub low_um: f64,
@@ -68,8 +68,8 @@ pub struct Scope {
     pub sample_s: f64,
     /// Length of the longest record \[s\].
     pub length_s: f64,
-    /// The command is an analogue signal sampled with the output, not held between rows: nothing faster than half the
-    /// sampling rate can be seen.
+    /// The command is an analogue signal sampled with the output, not held between rows: nothing above half the sampling rate is
+    /// visible.
     pub sampled_input: bool,
     /// Size of the units of command and position \[um\]: a user-defined effect has these units.
     pub per_unit: [f64; 2],
@@ -86,24 +86,24 @@ pub enum Role {
     Position,
 }
 
-/// One way of looking for an effect: most have one, hysteresis and saturation several.
+/// One form in which to search for an effect. Most have one; hysteresis and saturation have several.
 #[derive(Debug, Clone, Copy)]
 pub struct Candidate {
     /// Name among the forms of its effect; empty where there is one.
     pub name: &'static str,
     /// Its free numbers.
     pub params: &'static [FitParameter],
-    /// Range of the first number that a real rig shows; outside it another name is likelier when fits tie.
+    /// Range of the first number on real rigs. Outside it, another effect is likelier if two fits are equal.
     pub typical: (f64, f64),
-    /// Its signature cannot come from the response to the command: no misfit of a response can look like it.
+    /// Its signature cannot come from the response to the command, so no misfit of a response resembles it.
     pub off_response: bool,
     /// How it enters the fit.
     pub role: Role,
-    /// The smallest that matters: index of a number and its least size.
+    /// The smallest relevant size: index of a number, and its least size.
     pub smallest: Option<(usize, f64)>,
     /// Reference of that size: 1 for a factor.
     pub neutral: f64,
-    /// A rich form, tried only once the effect was found in a simple one.
+    /// A rich form, tried only after a simple form has found the effect.
     pub late: bool,
 }
 
@@ -136,7 +136,7 @@ impl Candidate {
         ]
     }
 
-    /// The same with the range of its first number that real rigs show.
+    /// The same with the range of its first number on real rigs.
     pub const fn typical(self, low: f64, high: f64) -> Self {
         Self {
             typical: (low, high),
@@ -144,7 +144,7 @@ impl Candidate {
         }
     }
 
-    /// The same with the smallest size of a number that matters.
+    /// The same with the smallest relevant size of a number.
     pub const fn smallest(self, index: usize, size: f64) -> Self {
         Self {
             smallest: Some((index, size)),
@@ -165,7 +165,7 @@ impl Candidate {
     }
 }
 
-/// The kind of record that separates an effect from similar ones.
+/// Kind of record that separates an effect from similar ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Experiment {
     /// Many lines at once, up to high frequencies.

@@ -52,7 +52,7 @@ impl EffectKind for FlowWander {
     }
 }
 
-/// An Ornstein-Uhlenbeck flow and the way that it went.
+/// An Ornstein-Uhlenbeck flow and its integral, the displacement so far.
 #[derive(Debug, Clone)]
 struct Wander {
     um_per_s: f64,

@@ -1,4 +1,4 @@
-//! `frame-jitter`: each frame is late by another time.
+//! `frame-jitter`: each frame is late by a random time.
 
 use super::{
     Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,

@@ -82,7 +82,7 @@ struct Swing {
     phase: f64,
     input: f64,
     output: f64,
-    /// The last time that was asked for, with its gain: one piece begins where the one before it ends.
+    /// Cache of the last time and its gain: a piece begins where the piece before it ends.
     known: (f64, f64),
 }
 

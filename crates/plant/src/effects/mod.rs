@@ -1,15 +1,15 @@
-//! What a real rig does that Eq. (6) does not: one file per effect, one table that everything iterates.
+//! Effects of real rigs that Eq. (6) lacks: one file per effect, and one table over which all users iterate.
 //!
-//! An effect is one type that implements [`EffectKind`]: its specification (id, place, parameters with units and bounds),
-//! its equation as an [`Action`] on the signal at its place, the [`Candidate`] forms that a search may try, and what tells
-//! it from others. The simulator, the emulator, the design, the search for discrepancies, its report and model files ask
-//! the kind; all are independent of the effect's name.
+//! An effect is one type that implements [`EffectKind`]. It gives its specification (id, place, parameters with units and bounds), its
+//! equation as an [`Action`] on the signal at its place, the [`Candidate`] forms that a search may try, and the experiment that separates
+//! it from others. Simulator, emulator, design, the search for discrepancies, its report and model files all use this trait and know no
+//! effect by name.
 //!
-//! To add one to this crate: its file here, and its line in `table.rs`. To add one from another crate: implement
-//! [`EffectKind`] there and hand it to [`register`]. To add one without a line of code: a [`Definition`], from a file.
+//! To add an effect to this crate, write its file here and its line in `table.rs`. From another crate, implement [`EffectKind`] and pass
+//! it to [`register`]. Without code, write a [`Definition`] in a file.
 //!
-//! Chain: command -> driver -> pzt -> chip (with the plant) -> bead -> camera -> record. Within a place effects act in the
-//! order of the table, whatever the order in a file, so that a model means the same however it is written.
+//! Chain: command -> driver -> pzt -> chip (with the plant) -> bead -> camera -> record. Effects at one place act in the order of the
+//! table. The order in a model file does not matter.
 
 mod action;
 mod candidate;
@@ -135,25 +135,25 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// What the effect with these numbers does at its place.
     fn act(&self, effect: &Effect) -> Action;
 
-    /// The linear part, at the start of a record, of an effect that changes with time, if any.
+    /// The linear part at the start of a record, for an effect that changes with time, if any.
     fn at_start(&self, effect: &Effect) -> Option<Zpk> {
         let _ = effect;
         None
     }
 
-    /// What a user wrote down, of an effect of the user's own.
+    /// The user's definition, for a user-defined effect.
     fn definition(&self) -> Option<&Definition> {
         None
     }
 
-    /// Factors on input, position and velocity for small motions about rest at a complex frequency \[rad/s\], where the
-    /// effect is neither linear nor without such factors.
+    /// Factors on input, position and velocity for small motions about rest at a complex frequency \[rad/s\], if the effect is not linear
+    /// but has such factors.
     fn small_motion(&self, effect: &Effect, s: Complex<f64>) -> Option<[Complex<f64>; 3]> {
         let _ = (effect, s);
         None
     }
 
-    /// Whether numbers that are each within their bounds also fit together.
+    /// Checks that numbers which are each within their bounds also fit together.
     ///
     /// # Errors
     /// What is wrong, and what would be right.
@@ -162,12 +162,12 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         Ok(())
     }
 
-    /// Whether it is a memoryless curve of its input: another curve is another form.
+    /// Whether it is a memoryless curve of its input, so that other curves are forms of the same effect.
     fn is_curve(&self) -> bool {
         false
     }
 
-    /// Whether slow motion gets another gain by it than fast motion: which of the two the model's gain is, is a matter of anchoring.
+    /// Whether it gives slow and fast motion different gains. Its form (anchoring) then says which of the two is the model's gain.
     fn has_two_gains(&self) -> bool {
         false
     }
@@ -177,7 +177,7 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
-    /// The candidate with the static curve of the effect and without memory, if any.
+    /// The candidate with the static curve of the effect but no memory, if any.
     fn memoryless(&self) -> Option<usize> {
         None
     }
@@ -187,29 +187,30 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
-    /// One effect that does what two of this kind do one after the other; `None` where only both can.
+    /// One effect equivalent to two of this kind in series; `None` if there is no such effect.
     fn combined(&'static self, first: &Effect, second: &Effect) -> Option<Effect> {
         let _ = (first, second);
         None
     }
 
-    /// The experiment that tells it from an effect of [`Spec::inseparable_from`], in words.
+    /// The experiment that separates it from an effect of [`Spec::inseparable_from`], in words.
     fn separate_from_double(&self) -> Option<&'static str> {
         None
     }
 
-    /// Whether a nameless cause has the same response from command to bead: then the separating experiment is always named.
+    /// Whether a cause outside the catalogue has the same response from command to bead. The report then always names the separating
+    /// experiment.
     fn has_doubles(&self) -> bool {
         false
     }
 
-    /// Memory of its input \[s\]: its freer forms are slower by a decade at most. Unlimited by default.
+    /// Memory of its input \[s\]; its freer forms are at most a decade slower. Unlimited by default.
     fn memory_s(&self, effect: &Effect) -> f64 {
         let _ = effect;
         f64::INFINITY
     }
 
-    /// The forms that a search may try; none for an effect that is not looked for by fitting.
+    /// The forms that a search may try; empty for an effect that no fit searches for.
     fn candidates(&self) -> &'static [Candidate] {
         &[]
     }
@@ -223,13 +224,13 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// The effect that candidate `index` stands for, with these values of its parameters.
     fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect;
 
-    /// Delay of a slow motion by candidate `index` \[s\], if it has that effect.
+    /// Delay that candidate `index` adds to a slow motion \[s\], if any.
     fn lag_s(&self, index: usize, values: &[f64]) -> Option<f64> {
         let _ = (index, values);
         None
     }
 
-    /// A start of one of its candidates that replaces an effect known only as a delay of slow motion by `lag_s`.
+    /// A start of one of its candidates in place of an effect known only to delay slow motion by `lag_s`.
     fn start_of_lag(&self, index: usize, lag_s: f64) -> Option<Vec<f64>> {
         let _ = (index, lag_s);
         None
@@ -304,13 +305,13 @@ impl Effect {
         }
     }
 
-    /// The same in a chain with the given micrometres per unit of the records' command and position. A user-defined effect keeps
-    /// its numbers; its signals are converted to its units.
+    /// The same in a chain whose records have the given micrometres per unit of command and position. A user-defined effect keeps its
+    /// numbers; its signals are converted to its units.
     pub fn counted_in(self, per_unit: [f64; 2]) -> Self {
         Self { per_unit, ..self }
     }
 
-    /// What one unit of the command and of the position count for \[um\].
+    /// Size of one unit of the command and of the position \[um\].
     pub fn per_unit(&self) -> [f64; 2] {
         self.per_unit
     }

@@ -2,18 +2,18 @@
 
 use super::{Effect, EffectKind, Experiment, Place};
 
-/// What is fixed about an effect apart from its equation.
+/// The fixed properties of an effect apart from its equation.
 #[derive(Debug, Clone, Copy)]
 pub struct Spec {
     /// The id in files and results.
     pub id: &'static str,
     /// Its place in the chain.
     pub place: Place,
-    /// The place as results print it, for an effect that may sit at either of two; empty: the place's own word.
+    /// The place as results print it, for an effect that may be at either of two places; empty: the place's own word.
     pub shown_at: &'static str,
     /// The equation in one line, for documents.
     pub equation: &'static str,
-    /// By its observable, for documents.
+    /// How it shows in a record, for documents.
     pub signature: &'static str,
     /// Acts on the plant's input although its place is the chip.
     pub ahead_of_plant: bool,
@@ -70,8 +70,8 @@ impl Form {
         }
     }
 
-    /// The two forms of an effect that changes slow motion against fast: for a model with the gain of slow motion (the first, and
-    /// the default in files), and for one with the gain of fast motion.
+    /// The two forms of an effect with different gains for slow and fast motion. The first, the default in files, is for a model
+    /// with the gain of slow motion; the second for a model with the gain of fast motion.
     pub const fn anchored(scalars: &'static [ParameterSpec]) -> [Self; 2] {
         [
             Self {
@@ -131,7 +131,7 @@ pub enum EffectError {
         /// Upper bound.
         upper: f64,
     },
-    /// Values that are each right and together wrong.
+    /// Values that are each valid but contradict each other.
     #[error("{id}: {message}")]
     Inconsistent {
         /// The effect.
@@ -141,7 +141,7 @@ pub enum EffectError {
     },
 }
 
-/// What is fixed about a parameter: name, unit and bounds.
+/// The fixed properties of a parameter: name, unit and bounds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ParameterSpec {
     /// The key in files and results.
@@ -235,7 +235,7 @@ impl Effect {
                     .find(|(name, _)| *name == s.name)
                     .map(|(_, v)| *v)
                     .or(s.default)
-                    // Not a number is refused below, with the parameter's name.
+                    // The check below refuses NaN, with the parameter's name.
                     .unwrap_or(f64::NAN)
             })
             .collect();

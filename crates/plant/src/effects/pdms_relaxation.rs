@@ -10,8 +10,8 @@ use crate::modal::Zpk;
 /// The wall as a standard linear solid: its stiffness, and with it the numerator of Eq. (A4), gets the factor
 /// `(1 + (1 + strength) time s) / (1 + time s)`.
 ///
-/// Gain far above the relaxation frequency is `1 + strength` times that below: the wall takes away from slow motion. In the
-/// denominator of Eq. (A4) the wall enters with the weight `alpha A2/A1`, about 2e-8: neglected.
+/// The gain far above the relaxation frequency is `1 + strength` times that below: the wall reduces slow motion. Its
+/// weight in the denominator of Eq. (A4), `alpha A2/A1`, is about 2e-8 and neglected.
 pub fn pdms_relaxation(time_s: f64, strength: f64) -> Effect {
     Effect::new(&KIND, AT_REST, &[time_s, strength], &[])
 }
@@ -31,7 +31,7 @@ const NUMBERS: &[ParameterSpec] = &[
     ParameterSpec::new("strength", "", -0.95, 20.0),
 ];
 
-/// A wall takes away: a fit that wants it to add has found something else.
+/// A wall only reduces motion: a fit with the other sign has found something else.
 const FREE: Candidate =
     Candidate::chain(&[log("time_s", 1e-3, 50.0), lin("strength", 0.0, 5.0, 1e-3)])
         .typical(0.03, 2.0)

@@ -10,8 +10,8 @@ use nalgebra::Complex;
 
 /// Creep: `x = x0 (1 + g log10(t / 0.1 s))` after a step, `g` the part of the step gained per decade of time.
 ///
-/// Realised as a bank of first-order lags, two per decade from 0.1 ms to 1000 s, each of weight g/2: linear,
-/// within 0.1 % of g of the logarithm from 1 ms to 300 s (Kuhnen, Janocha 1998, linear creep operators).
+/// The block is a bank of first-order lags, two per decade from 0.1 ms to 1000 s, each of weight g/2. It is linear, and differs
+/// from the logarithm by at most 0.1 % of g from 1 ms to 300 s (Kuhnen, Janocha 1998, linear creep operators).
 pub fn pzt_creep(per_decade: f64) -> Effect {
     Effect::new(&KIND, AT_REST, &[per_decade], &[])
 }
@@ -90,7 +90,7 @@ impl EffectKind for PztCreep {
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: [Candidate; 3] = {
             let [slow, fast] = FREE.anchored();
-            // An onset below the shortest row is the form before it, one beyond the records no creep.
+            // An onset below the shortest row gives the form before this one; an onset beyond the records gives no creep.
             let onset = Candidate {
                 name: "onset",
                 params: &[PER_DECADE_FREE, log("onset_s", 1e-3, 3.0)],
@@ -137,7 +137,7 @@ enum Since {
     Onset(f64),
 }
 
-/// Share of a lag below which it is left out, in parts of the others': its zero would be its pole.
+/// Lags whose share is below this part of the others' are left out: pole and zero would coincide.
 const LEAST_SHARE: f64 = 1e-6;
 
 /// `1 + sum (g/n) (1/(1 + tau s) - (1 - exp(-t0/tau)))`: the step response is `1 + g log10(t/t0)`. With an onset the shares are
@@ -167,8 +167,8 @@ fn creep(per_decade: f64, since: Since) -> Zpk {
                 .map(|(r, of_lag)| of_lag * r / (s + r))
                 .sum::<f64>()
     };
-    // Poles in falling order -r (r falls). A zero lies between each pair of neighbours; the last one lies beyond the
-    // fastest pole for g > 0 and between the slowest pole and the origin for g < 0.
+    // Poles in falling order -r (r falls). One zero is between each pair of neighbours. The last one is beyond the fastest pole
+    // for g > 0, and between the slowest pole and the origin for g < 0.
     let mut brackets: Vec<(f64, f64)> = rates.windows(2).map(|w| (-w[0], -w[1])).collect();
     if share > 0.0 {
         brackets.push((-rates[0] * 1e3, -rates[0]));
@@ -178,7 +178,7 @@ fn creep(per_decade: f64, since: Since) -> Zpk {
     let zeros = brackets
         .into_iter()
         .map(|(mut low, mut high)| {
-            // Just left of a pole the sum has the sign of -share, just right of it that of share.
+            // Just left of a pole the sum has the sign of -share, just right the sign of share.
             let left_of_high = if high == 0.0 { 1.0 } else { -share.signum() };
             for _ in 0..200 {
                 let middle = 0.5 * (low + high);

@@ -10,17 +10,16 @@ use super::{
 
 /// Bouc-Wen: `x = u - fraction h`, `dh/dt = du/dt - beta |du/dt| h - gamma du/dt |h|`.
 ///
-/// Bouc 1967, Wen 1976 (J. Eng. Mech. Div. ASCE 102:249) with exponent 1 and A = 1, in the form used for piezos
-/// (Low, Guo 1995, IEEE Trans. Control Syst. Technol. 3:119). At small amplitude h = u and the gain is
-/// `1 - fraction`; at large amplitude h saturates at `1/(beta + gamma)` and the gain approaches 1. The equation is
-/// integrated in closed form along the straight way of each change of u. `|gamma| <= beta` keeps the loop dissipative.
+/// Bouc 1967, Wen 1976 (J. Eng. Mech. Div. ASCE 102:249) with exponent 1 and A = 1, in the form used for piezos (Low, Guo 1995, IEEE
+/// Trans. Control Syst. Technol. 3:119). At small amplitude h = u and the gain is `1 - fraction`; at large amplitude h saturates at
+/// `1/(beta + gamma)` and the gain approaches 1. The equation is integrated in closed form along each straight change of u.
+/// `|gamma| <= beta` keeps the loop dissipative.
 pub fn bouc_wen(fraction: f64, beta_per_um: f64, gamma_per_um: f64) -> Effect {
     Effect::new(&KIND, BOUC_WEN, &[fraction, beta_per_um, gamma_per_um], &[])
 }
 
-/// The same equation as it is often programmed for sampled commands: one explicit step per change of the command,
-/// `h += du - beta |du| h - gamma du |h|`. It differs from [`bouc_wen`] where a single change `du` is not small against
-/// `1/(beta + gamma)`.
+/// The same equation as it is often programmed for sampled commands: one explicit step per change of the command, `h += du - beta |du| h
+/// - gamma du |h|`. It differs from [`bouc_wen`] if a single change `du` is not small against `1/(beta + gamma)`.
 pub fn bouc_wen_explicit(fraction: f64, beta_per_um: f64, gamma_per_um: f64) -> Effect {
     Effect::new(&KIND, EXPLICIT, &[fraction, beta_per_um, gamma_per_um], &[])
 }
@@ -45,12 +44,12 @@ pub struct Curve {
     pub quadratic_per_um: f64,
     /// Of the operators' sum \[1/um^2\]: the gain differs between the ends and the middle of the stroke.
     pub cubic_per_um2: f64,
-    /// Of the input, past the memory \[1/um\]: with a quadratic term of the other sign the loops lose more at one end of the
-    /// stroke than at the other.
+    /// Of the input, parallel to the memory \[1/um\]. With an output term of the other sign, loops lose more at one end of the stroke
+    /// than at the other.
     pub input_quadratic_per_um: f64,
 }
 
-/// Play operators inside static curves, for loops that are not the same at all places of the stroke.
+/// Play operators inside static curves, for loops that vary along the stroke.
 ///
 /// Operators and a polynomial of the input as in Gu, Zhu, Su 2014, IEEE Trans. Ind. Electron. 61:1583 (modified
 /// Prandtl-Ishlinskii), with a curved output.
@@ -129,8 +128,8 @@ static SPEC: Spec = Spec {
     separate_by: "the same sine at a second amplitude and a second frequency, and its third harmonic",
 };
 
-/// Thresholds of the freely weighted play operators in parts of the stroke: even, closer together where small loops are, and
-/// up to the ends of the stroke, where only the widest loops turn.
+/// Thresholds of the freely weighted play operators, in parts of the stroke: even, closer together for small loops, and up to the full
+/// stroke, which only the widest loops reach.
 const LEVELS: [f64; 12] = [
     0.0, 0.03, 0.08, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95,
 ];
@@ -172,19 +171,20 @@ const CANDIDATES: &[Candidate] = &[
         late: true,
         ..Candidate::chain(PLAY_NUMBERS.split_at(LEVELS.len() + 1).0)
     },
-    // Never a start: play operators without memory.
+    // Play operators without memory; never a start of the search.
     Candidate {
         name: "curvature",
         late: true,
         ..Candidate::chain(&[QUADRATIC, CUBIC])
     },
-    // Where the piezo itself is what is measured. Behind a chip a cubic curve may be a saturation's or a spring's, which have names.
+    // For records of the piezo itself. Behind a chip, a cubic curve may come from a saturation or a spring, which are effects of their
+    // own.
     Candidate {
         name: "curved play",
         late: true,
         ..Candidate::chain(PLAY_NUMBERS)
     },
-    // Of programs, not of piezos: one step of the equation a command.
+    // Occurs in programs, not in piezos: one step of the equation per command.
     Candidate {
         name: "bouc-wen-explicit",
         late: true,
@@ -333,7 +333,7 @@ const EDGES: [f64; CLASSES + 1] = [
     f64::INFINITY,
 ];
 
-/// Number of play operators that stand for an exponential density.
+/// Number of play operators that approximate an exponential density.
 const CLASSES: usize = 14;
 
 /// Thresholds in widths and shares of an exponential density of play operators, each class at its mean.
@@ -354,7 +354,7 @@ fn classes() -> ([f64; CLASSES], [f64; CLASSES]) {
     (radii, shares)
 }
 
-/// A piece of a block without rate: it follows the input to both ends.
+/// A piece of a rate-independent block: it follows the input to both ends.
 fn followed(h_s: f64, input: Piece, mut follow: impl FnMut(f64) -> f64) -> Piece {
     let start = follow(input.start);
     let end = if input.end == input.start {
@@ -375,7 +375,7 @@ struct BoucWen {
     input: f64,
 }
 
-/// Beyond this \[um\] the explicit recursion has run away; it is stopped there so that no infinity enters the loop.
+/// Limit of the explicit recursion \[um\]: beyond it the recursion diverges, and no infinity may enter the loop.
 const RUNAWAY_UM: f64 = 1e6;
 
 impl BoucWen {
@@ -414,7 +414,7 @@ impl Block for BoucWen {
 /// `dh/du = 1 - (beta s + gamma sgn h) ...` is linear, so h moves along exponentials.
 fn exact(h: f64, from: f64, to: f64, beta: f64, gamma: f64) -> f64 {
     let direction = if to > from { 1.0 } else { -1.0 };
-    // Mirrored so that the input rises: with g = direction * h, dg/dv = 1 - beta g - gamma |g|, v the way travelled.
+    // Mirrored so that the input rises: with g = direction * h, dg/dv = 1 - beta g - gamma |g|, v the distance travelled.
     let mut g = direction * h;
     let mut way = (to - from).abs();
     if g < 0.0 {
@@ -434,7 +434,7 @@ fn exact(h: f64, from: f64, to: f64, beta: f64, gamma: f64) -> f64 {
     direction * relax(g, beta + gamma, way)
 }
 
-/// `g` after `dg/dv = 1 - rate g` over `way`.
+/// `g` after `dg/dv = 1 - rate g` over the distance `way`.
 fn relax(g: f64, rate: f64, way: f64) -> f64 {
     let z = -rate * way;
     let exp = z.exp();

@@ -68,8 +68,8 @@ impl EffectKind for PztResonance {
     }
 
     fn of_lag(&self, lag_s: f64, scope: &Scope) -> Vec<(usize, Vec<f64>)> {
-        // Faster than the frames its ringing shows by its phase from one frame to the next only: it starts from each quarter of
-        // a cycle, because the sum of squares has a valley in each.
+        // If the resonance is faster than the frames, only the phase from frame to frame shows its ringing. The sum of squares
+        // then has a minimum in each quarter of a cycle, so the search starts in each.
         const DAMPING: f64 = 0.1;
         let hz = 2.0 * DAMPING / (TAU * lag_s);
         let quarters: &[f64] = if hz * scope.sample_s > 1.0 {

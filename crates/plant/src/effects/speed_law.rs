@@ -1,11 +1,11 @@
-//! What acts on the speed of the input: the common frame of such blocks.
+//! Blocks that act on the speed of the input: their common frame.
 
 use crate::effects::action::{Block, Piece};
 use std::fmt;
 
-/// A law that makes the speed of the output of the speed of the input.
+/// A law that maps the speed of the input to the speed of the output.
 pub(crate) trait SpeedLaw: fmt::Debug + Clone + Send + Sync + 'static {
-    /// How far the output goes in a jump of the input, which is infinitely fast.
+    /// How far the output moves in a jump of the input, which is infinitely fast.
     fn jump(&self, jump: f64) -> f64 {
         jump
     }
@@ -13,10 +13,10 @@ pub(crate) trait SpeedLaw: fmt::Debug + Clone + Send + Sync + 'static {
     /// Motion of the output while the input moves by `moved` in `h_s` > 0 with a speed that changes linearly from `a` to `b`.
     fn travel(&mut self, moved: f64, a: f64, b: f64, h_s: f64) -> f64;
 
-    /// Speed of the output at a speed of the input, as things stand.
+    /// Speed of the output for a speed of the input, in the present state.
     fn speed(&self, speed: f64) -> f64;
 
-    /// As [`Block::speed`], for laws that stop nothing.
+    /// As [`Block::speed`], for laws that never stop the motion.
     fn slope(&self, speed: f64) -> f64 {
         speed
     }

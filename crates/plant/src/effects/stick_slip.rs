@@ -1,4 +1,4 @@
-//! `stick-slip`: the bead sticks until it breaks free, and then moves until it is slow.
+//! `stick-slip`: the bead sticks until it breaks free, then moves until the flow is slow.
 
 use super::speed_law::{OfSpeed, SpeedLaw};
 use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec};

@@ -51,7 +51,7 @@ impl EffectKind for Stiffening {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        // Softening is excluded: it fitted the round knee of a saturation.
+        // Softening is excluded: it would fit the round knee of a saturation.
         const ALL: &[Candidate] =
             &[Candidate::chain(&[lin("per_um2", 0.0, 0.5, 1e-4)]).typical(0.0, 0.3)];
         ALL

@@ -1,4 +1,4 @@
-//! The table of all effects, in the order of the chain, and those that came from elsewhere.
+//! The table of all effects in the order of the chain, and the effects registered by other crates.
 
 use super::{Effect, EffectError, EffectKind};
 use std::sync::{PoisonError, RwLock};
@@ -38,7 +38,7 @@ static TABLE: [&dyn EffectKind; 31] = [
     &super::frame_repeats::KIND,
 ];
 
-/// Effects from elsewhere, in the order in which they came.
+/// Effects from other crates, in the order of their registration.
 static REGISTERED: RwLock<Vec<&'static dyn EffectKind>> = RwLock::new(Vec::new());
 
 /// The effects of the catalogue, without those that a program has registered.
@@ -66,7 +66,7 @@ impl Effect {
     /// An effect of a known id, in its first form, from parameters by name; those left out have their defaults.
     ///
     /// # Errors
-    /// An unknown id or parameter, a value out of range, a parameter that is needed and missing.
+    /// An unknown id or parameter, a value out of range, a required parameter that is missing.
     pub fn of(id: &str, parameters: &[(&str, f64)]) -> Result<Self, EffectError> {
         let kind = find(id).ok_or_else(|| EffectError::UnknownEffect {
             id: id.to_owned(),
@@ -76,7 +76,7 @@ impl Effect {
     }
 }
 
-/// Where an effect stands among all; one that is not known acts last at its place.
+/// Rank of an effect among all; an unknown one acts last at its place.
 pub(super) fn position(id: &str) -> usize {
     if let Some(i) = TABLE.iter().position(|k| k.spec().id == id) {
         return i;
@@ -88,7 +88,7 @@ pub(super) fn position(id: &str) -> usize {
 /// Makes an effect of another crate known to model files, simulation and search, for the life of the process.
 ///
 /// # Errors
-/// [`EffectError::Taken`] where an effect of that id is known; the very same one again is no error.
+/// [`EffectError::Taken`] if another effect has that id. Registering the same effect again is no error.
 pub fn register(kind: &'static dyn EffectKind) -> Result<(), EffectError> {
     let id = kind.spec().id;
     let taken = || EffectError::Taken { id };

@@ -50,7 +50,7 @@ impl EffectKind for TimeDelay {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
-        // What is too long for a record is the search's business.
+        // The search decides which delay is too long for a record.
         const ALL: &[Candidate] = &[Candidate::chain(&[lin("delay_s", 0.0, 3600.0, 1e-5)])
             .typical(0.0002, 0.05)
             .smallest(0, 5e-5)];

@@ -68,7 +68,7 @@ struct Valve {
     asymmetry: f64,
 }
 
-/// Integral over a piece of the size of a speed that runs straight from `a` to `b`.
+/// Integral over a piece of the absolute speed, which changes linearly from `a` to `b`.
 fn way(a: f64, b: f64, h_s: f64) -> f64 {
     if a * b >= 0.0 {
         return 0.5 * (a.abs() + b.abs()) * h_s;

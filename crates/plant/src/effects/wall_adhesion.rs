@@ -72,7 +72,7 @@ struct Adhesion {
     threshold: f64,
 }
 
-/// Integral over a piece of the dead zone of a speed that runs straight from `a` to `b`.
+/// Integral over a piece of the dead zone of a speed that changes linearly from `a` to `b`.
 fn dead_zone_travel(a: f64, b: f64, threshold: f64, h: f64) -> f64 {
     let zone = |v: f64| (v.abs() - threshold).max(0.0) * v.signum();
     let (small, large) = (a.abs().min(b.abs()), a.abs().max(b.abs()));

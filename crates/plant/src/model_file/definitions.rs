@@ -1,4 +1,4 @@
-//! Effects of the user's own in a file: `[[effects]]` of an effects file, `[[definitions]]` of a model.
+//! User-defined effects in a file: `[[effects]]` of an effects file, `[[definitions]]` of a model.
 
 use super::table::{Table, Value, nearest};
 use super::write::{float, floats, quoted};
@@ -48,8 +48,8 @@ impl Definition {
     /// Reads effects from the text of a TOML file, `[[effects]]` each, and makes them known; `file_name` is for the messages.
     ///
     /// # Errors
-    /// Text that is not TOML, unknown or missing keys, wrong expressions, names unknown at their place,
-    /// bounds and starts that do not fit, an id that is taken: with line, column, key, value and what would be right.
+    /// Text that is not TOML, unknown or missing keys, wrong expressions, names unknown at their place, bounds and starts that do
+    /// not fit, an id already in use. Each error names line, column, key, value and what would be right.
     pub fn from_toml_str(
         text: &str,
         file_name: &str,
@@ -123,7 +123,7 @@ pub(super) fn read_all<'i>(
     })
 }
 
-/// Place of the value of a dotted key, or of the longest existing part.
+/// Position of the value of a dotted key, or of the longest part that exists.
 fn span_of(entries: &DeTable<'_>, key: &str) -> Option<std::ops::Range<usize>> {
     let (head, rest) = key.split_once('.').unwrap_or((key, ""));
     let value = entries.get(head)?;

@@ -1,4 +1,4 @@
-//! A table of a TOML file, with what is needed to say where in the file something is wrong.
+//! A table of a TOML file that knows the position of its keys, for error messages.
 
 use crate::effects::ParameterSpec;
 use crate::error::{ModelError, ModelProblem, Position};

@@ -210,7 +210,7 @@ proptest! {
         let mangled: String = text[..at].iter().copied().chain(put.chars())
             .chain(text[end..].iter().copied()).collect();
         if let Ok(model) = Model::from_toml_str(&mangled, "m.toml") {
-            // What is accepted can be run.
+            // A model that is accepted can be run.
             prop_assert!(crate::Chain::new(&model).is_ok());
         }
     }

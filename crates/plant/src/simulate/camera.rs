@@ -12,7 +12,7 @@ pub(super) struct Camera {
     pub(super) exposure_s: f64,
     /// `t' = (1 + skew) t`.
     pub(super) skew: f64,
-    /// What light, table and sensor make of a position.
+    /// Effects of light, table and sensor on a position.
     pub(super) shown: Vec<Box<dyn Shown>>,
     pub(super) localisation_um: f64,
     pub(super) noise: Option<Random>,

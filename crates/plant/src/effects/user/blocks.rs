@@ -1,4 +1,4 @@
-//! An effect of the user's own as a part of the chain.
+//! A user-defined effect as a block of the chain.
 
 use super::core::{Core, Seen};
 use crate::effects::{Around, Block, Piece, Shown};

@@ -5,7 +5,7 @@ use super::definition::{
 };
 use std::sync::Arc;
 
-/// States stay below this; what grows beyond it has no solution.
+/// Limit of the states; equations that grow beyond it have no solution.
 const LARGEST: f64 = 1e12;
 
 /// The signals at one instant.
@@ -13,7 +13,7 @@ const LARGEST: f64 = 1e12;
 pub struct Seen {
     /// Time since the start, s.
     pub time_s: f64,
-    /// What enters at the place, from where the model rests.
+    /// Input of the place, measured from the rest of the model.
     pub input: f64,
     /// What the plant gives.
     pub position: f64,
@@ -29,7 +29,7 @@ pub(super) struct Core {
     count: usize,
     start: [f64; MOST_STATES],
     states: [f64; MOST_STATES],
-    /// What was given last, um.
+    /// The last output, um.
     output: f64,
     /// Size of the equations' unit at input, position and output, um.
     units: [f64; 3],
@@ -86,7 +86,7 @@ impl Core {
         v
     }
 
-    /// The output at an instant; where the expression has no value, the last one holds.
+    /// The output at an instant; if the expression has no value, the last output is held.
     pub(super) fn output(&self, seen: &Seen) -> f64 {
         self.output_with(seen, &self.states)
     }
@@ -100,7 +100,7 @@ impl Core {
         }
     }
 
-    /// The output expected `h_s` later, states gone on at their present rate.
+    /// The output expected `h_s` later, if the states continue at their present rate.
     pub(super) fn output_ahead(&self, h_s: f64, now: &Seen, then: &Seen) -> f64 {
         let rates = self.rates(now, &self.states);
         self.output_with(then, &self.moved(&self.states, &rates, h_s))
@@ -127,7 +127,7 @@ impl Core {
         std::array::from_fn(|i| (states[i] + h_s * rates[i]).clamp(-LARGEST, LARGEST))
     }
 
-    /// States and memory go on over a piece, by the trapezoidal rule of Heun.
+    /// Advances states and memory over a piece by the trapezoidal rule of Heun.
     pub(super) fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen) {
         if self.has_states() && h_s > 0.0 {
             let first = self.rates(now, &self.states);
@@ -143,7 +143,7 @@ impl Core {
         self.output
     }
 
-    /// The outputs just after the beginning and at the end of a piece, states and memory gone on.
+    /// The outputs just after the beginning and at the end of a piece; advances states and memory.
     pub(super) fn piece(&mut self, h_s: f64, now: &Seen, then: &Seen) -> (f64, f64) {
         let start = self.give(now);
         if h_s <= 0.0 {

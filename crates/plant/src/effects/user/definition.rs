@@ -1,4 +1,4 @@
-//! What a user writes down of an effect, and its check.
+//! A user's definition of an effect, and its check.
 
 use super::expression::{ExpressionProblem, Program};
 use crate::effects::Place;
@@ -22,9 +22,9 @@ pub enum Site {
     Driver,
     /// On the piezo's displacement.
     Pzt,
-    /// On what enters the plant; sees the plant's own position and velocity: feedback.
+    /// On the plant's input; sees the plant's own position and velocity: feedback.
     Chip,
-    /// Replaces the plant's output; sees the plant's input, too.
+    /// Replaces the plant's output; also sees the plant's input.
     Plant,
     /// On the bead's motion.
     Bead,
@@ -103,14 +103,14 @@ pub struct UserState {
     pub name: String,
     /// Its rate of change per second.
     pub rate: String,
-    /// Its value at rest, of parameters only.
+    /// Its value at rest; an expression of parameters only.
     pub start: String,
 }
 
-/// An effect of the user's own, as its file has it.
+/// A user-defined effect, as its file gives it.
 ///
-/// Signals are displacements from where the model rests \[um, or whatever the records are in\]: `input` what enters at the
-/// place, `output` what the effect gave a step before, `position` and `velocity` \[1/s\] what the plant gives, `time` \[s\].
+/// Signals are displacements from the model's rest \[um, or the unit of the records\]. `input` enters at the place, `output` is
+/// the effect's result one step before, `position` and `velocity` \[per second\] come from the plant, `time` is in s.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Definition {
     /// Its name in files and results.
@@ -137,9 +137,9 @@ pub(super) const VELOCITY: usize = 3;
 pub(super) const TIME: usize = 4;
 pub(super) const SIGNALS: [&str; 5] = ["input", "output", "position", "velocity", "time"];
 
-/// Most numbers and states of an effect together.
+/// Maximum number of parameters and states of an effect together.
 pub(super) const MOST: usize = 16;
-/// Most states of an effect.
+/// Maximum number of states of an effect.
 pub(super) const MOST_STATES: usize = 6;
 
 /// A definition with its expressions compiled. Names have the order signals, parameters, states.

@@ -1,8 +1,8 @@
-//! An expression in the field's notation, compiled once to a list of steps that are run without allocation.
+//! An expression in the usual notation, compiled once to a list of steps that run without allocation.
 //!
 //! `+ - * / % ^`, comparisons and `&&`, `||`, `!` (1 for true, 0 for false), parentheses, numbers, names, and the functions of
-//! [`FUNCTIONS`]. Parsing and folding of constants are those of the crate `fasteval3`; its evaluation looks names up as text and
-//! allocates for functions, so its result is compiled again here, with a slot for every name.
+//! [`FUNCTIONS`]. The crate `fasteval3` parses and folds constants. Its evaluation looks up names as text and allocates for
+//! functions, so this module compiles its result again, with a slot for every name.
 
 use fasteval3::compiler::{IC, Instruction, InstructionI};
 use fasteval3::{Compiler, EmptyNamespace, Parser, Slab};
@@ -28,7 +28,7 @@ pub const FUNCTIONS: &[&str] = &[
     "round", "pi", "e",
 ];
 
-/// Deepest nesting of what is still to be combined.
+/// Deepest nesting of operands not yet combined.
 const DEEPEST: usize = 24;
 
 /// Most steps of an expression.
@@ -50,7 +50,7 @@ pub(super) struct Program {
 }
 
 impl Program {
-    /// Compiles a text in which `names` may stand.
+    /// Compiles a text that may contain `names`.
     ///
     /// # Errors
     /// A text that is no expression, an unknown name or function: what is wrong and what would be right.
@@ -99,7 +99,7 @@ impl Program {
         self.names.contains(&name)
     }
 
-    /// Its value, names standing for `values` in the order in which they were given. Allocates nothing.
+    /// Its value; the names have these `values`, in the order given at compilation. Allocates nothing.
     pub(super) fn value(&self, values: &[f64]) -> f64 {
         let mut stack = [0.0_f64; DEEPEST];
         let mut top = 0;
@@ -139,7 +139,7 @@ fn sign(x: f64) -> f64 {
     if x == 0.0 { 0.0 } else { x.signum() }
 }
 
-/// Whole and halved powers are far cheaper than the general one.
+/// Whole and half-integer powers are far cheaper than the general one.
 fn power(x: f64, y: f64) -> f64 {
     if y == 2.0 {
         x * x
@@ -275,7 +275,7 @@ impl Builder<'_> {
     }
 }
 
-/// The parser takes `-a^2` for `(-a)^2`, the field for `-(a^2)`: neither is guessed.
+/// The parser reads `-a^2` as `(-a)^2`, people as `-(a^2)`: such a text is refused.
 fn minus_before_power(text: &str) -> Result<(), ExpressionProblem> {
     let c: Vec<char> = text.chars().filter(|c| !c.is_whitespace()).collect();
     for (i, _) in c.iter().enumerate().filter(|(_, c)| **c == '-') {

@@ -1,8 +1,8 @@
-//! Effects of the user's own: a place, an expression in the field's notation, parameters with unit, bounds and start.
+//! User-defined effects: a place, an expression in the usual notation, parameters with unit, bounds and start.
 //!
-//! A [`Definition`] comes from a file (`cellpos reconcile --effects`) or stands in a model file; [`define`] makes it known,
-//! after which it is simulated, searched, named, written and read like any other. Here are its equations; the file's form is
-//! the model file's business.
+//! A [`Definition`] comes from an effects file (`cellpos reconcile --effects`) or from a model file. After [`define`], the effect
+//! is simulated, searched, named, written and read like any other. This module holds its equations; the module `model_file` reads
+//! the file.
 
 mod blocks;
 mod core;
@@ -22,7 +22,7 @@ use definition::{Compiled, MOST_STATES};
 use nalgebra::{Complex, DMatrix, DVector};
 use std::sync::Arc;
 
-/// An effect of the user's own among the kinds of effects.
+/// A user-defined effect as a kind of effect.
 #[derive(Debug)]
 struct UserKind {
     definition: Definition,
@@ -36,10 +36,10 @@ fn kept(text: &str) -> &'static str {
     Box::leak(text.to_owned().into_boxed_str())
 }
 
-/// Makes an effect of the user's own known to model files, simulation and search, for the life of the process.
+/// Makes a user-defined effect known to model files, simulation and search, for the life of the process.
 ///
 /// # Errors
-/// A definition that is refused, or another effect of the same id; the very same definition again is no error.
+/// A definition that is refused, or another effect with the same id. The same definition again is no error.
 pub fn define(definition: &Definition) -> Result<&'static dyn EffectKind, DefinitionError> {
     let compiled = definition.compile()?;
     let taken = |message: &str| DefinitionError {
@@ -61,7 +61,7 @@ pub fn define(definition: &Definition) -> Result<&'static dyn EffectKind, Defini
     Ok(kind)
 }
 
-/// Whether two definitions mean the same, wherever their searches begin.
+/// Whether two definitions mean the same; the starts of their searches may differ.
 fn same(a: &Definition, b: &Definition) -> bool {
     let bare = |d: &Definition| {
         let mut d = d.clone();
@@ -199,7 +199,7 @@ impl EffectKind for UserKind {
         Some(&self.definition)
     }
 
-    /// Of motions of a hundredth of a micrometre about rest, by central differences.
+    /// By central differences of 0.01 um about rest.
     fn small_motion(&self, effect: &Effect, s: Complex<f64>) -> Option<[Complex<f64>; 3]> {
         const SIZE: f64 = 0.01;
         let slopes = self.core(effect).slopes(SIZE);
