@@ -1,4 +1,4 @@
-//! The settings of vision, found with the live camera and written into the rig file.
+//! Finds the settings of vision with the live camera, and writes them into the rig file.
 
 use crate::bench::Bench;
 use crate::capture::Capture;
@@ -14,7 +14,7 @@ use serde::Serialize;
 use std::path::Path;
 use toml_edit::{DocumentMut, Item, Table, Value};
 
-/// Frames that settings are found in, spread over the look, and frames in the picture.
+/// Number of frames for the search of settings, spread over the recording, and number of frames in the picture.
 const LOOKED_AT: usize = 40;
 const SHOWN: usize = 4;
 /// Beads marked in a frame; more than a field of view holds.
@@ -27,11 +27,11 @@ pub struct FoundBeads {
     pub camera: String,
     /// The table `[vision]`.
     pub vision: LocaliserConfig,
-    /// Objects that stood out in the frames looked at.
+    /// Distinct objects in the examined frames.
     pub objects: usize,
-    /// Of these, taken as beads.
+    /// Objects accepted as beads.
     pub taken: usize,
-    /// Cut by the border; with unusual size or contrast; not fitted by the mean profile.
+    /// Refused objects: cut by the border, of unusual size or contrast, or not fitted by the mean profile.
     pub refused: [usize; 3],
     /// Median contrast over noise.
     pub snr: f64,
@@ -39,8 +39,8 @@ pub struct FoundBeads {
     pub sight: Sight,
 }
 
-/// Looks at the camera of a rig for a time, finds settings for its beads and tries them with the loop's tracker. The picture shows
-/// what was taken for beads, in a few frames below each other; it is there even when nothing was found.
+/// Records the camera of a rig for a time, finds settings for its beads and tries them with the loop's tracker. The picture marks
+/// the accepted beads in a few frames below each other; there is a picture even if no bead was found.
 ///
 /// # Errors
 /// The camera does not deliver, or the rig follows a cell.
@@ -160,10 +160,10 @@ fn sheet(frames: &[&FrameBuffer], config: Option<&LocaliserConfig>) -> Result<Rg
     Ok(sheet)
 }
 
-/// Writes the table `[vision]` of a rig file and leaves all else in it, comments included, as it is. True if there was a table.
+/// Writes the table `[vision]` of a rig file and changes nothing else, not even comments. True if there was a table.
 ///
 /// # Errors
-/// The file cannot be read or written, or is no TOML.
+/// The file cannot be read or written, or is not TOML.
 pub fn write_vision(rig: &Path, vision: &LocaliserConfig) -> Result<bool, Failure> {
     change(rig, "[vision]", |document| set(document, vision))
 }

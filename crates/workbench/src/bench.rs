@@ -7,7 +7,7 @@ use cellpos_rig::{Camera, Clock};
 use cellpos_session::rig_file::CameraConfig;
 use cellpos_session::{Failure, RigFile};
 
-/// Board and camera on the machine's clock; each is opened when it is asked for.
+/// Board and camera on the machine's clock; each is opened at its first use.
 pub struct Bench {
     file: RigFile,
     emulated: Option<EmulatedRig>,
@@ -17,10 +17,10 @@ pub struct Bench {
 pub(crate) type Board = BoardHost<Box<dyn Port>>;
 
 impl Bench {
-    /// A bench with the devices of a rig file; nothing is opened yet.
+    /// A bench with the devices of a rig file. Opens nothing yet.
     ///
     /// # Errors
-    /// A value of the emulated rig that cannot be.
+    /// An invalid value of the emulated rig.
     pub fn of(file: RigFile) -> Result<Self, Failure> {
         let emulated =
             if file.actuator.is_emulated() || matches!(file.camera, CameraConfig::Emulated {}) {
@@ -47,7 +47,7 @@ impl Bench {
         BoardHost::connect(self.line()?, Clock::Real).map_err(Failure::failed)
     }
 
-    /// The line to the board, with nothing said on it.
+    /// The line to the board; no message was sent yet.
     ///
     /// # Errors
     /// The port cannot be opened.

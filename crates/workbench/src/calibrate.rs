@@ -19,10 +19,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 use toml_edit::value;
 
-/// Pulses: how far, how long, how many.
+/// Amplitude, duration and number of the pulses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pulses {
-    /// To each side of where the PZT stands, um.
+    /// Amplitude to each side of the PZT's present displacement, um.
     pub amplitude_um: f64,
     /// Of each side, ms.
     pub length_ms: u32,
@@ -31,7 +31,7 @@ pub struct Pulses {
 }
 
 impl Default for Pulses {
-    /// 0.2 um for 15 ms: 1.3 um of way at the paper's gain, a tenth of the view.
+    /// 0.2 um for 15 ms: the bead moves 1.3 um at the paper's gain, a tenth of the view.
     fn default() -> Self {
         Self {
             amplitude_um: 0.2,
@@ -48,7 +48,7 @@ pub struct Response {
     pub gain_px_per_s: [f64; 2],
     /// Its standard deviation, per axis.
     pub sd_px_per_s: f64,
-    /// From a command to the motion that it causes, as frames show it, ms.
+    /// Delay from a command to its motion in the frames, ms.
     pub lag_ms: f64,
     /// Frames used.
     pub frames: usize,
@@ -76,7 +76,7 @@ impl Response {
         (axis, sign, tilt_deg, sd_deg)
     }
 
-    /// The calibration, with a pixel size from elsewhere. A tilt within two of its standard deviations counts as none.
+    /// The calibration, with a pixel size from elsewhere. A tilt below two of its standard deviations counts as zero.
     pub fn calibration(&self, pixel_um: f64, pixel_um_sd: f64, method: String) -> CalibrationFile {
         let (axis, sign, tilt_deg, sd_deg) = self.direction();
         let [width, height] = self.size_px.map(|px| px.saturating_sub(1) as f64);
@@ -102,7 +102,7 @@ impl Response {
     }
 }
 
-/// Moves the PZT by pulses about its displacement and watches the bead. Parked on every way out.
+/// Moves the PZT by pulses about its displacement and records the bead. The board is parked on success, error and panic.
 ///
 /// # Errors
 /// No camera, no board, no bead, a bead that does not move with the PZT.
@@ -116,7 +116,7 @@ pub fn measure(
     let response = loop {
         match pulsed(bench, pulses, &mut progress)? {
             Ok(response) => break response,
-            // The bead left the picture with the pulses: the next one is waited for.
+            // The pulses moved the bead out of the picture: wait for the next one.
             Err(_) if tried < TRIES => tried += 1,
             Err(seen) => {
                 return Err(Failure::bad_input(
@@ -139,7 +139,7 @@ pub fn measure(
     Ok(response)
 }
 
-/// Once: the response, or in how many frames a bead was seen where these are too few.
+/// One attempt: the response, or the number of frames with a bead if they are too few.
 fn pulsed(
     bench: &Bench,
     pulses: Pulses,
@@ -165,10 +165,10 @@ fn pulsed(
     Ok(fit(&commands, &sightings, size_px).ok_or(sightings.len()))
 }
 
-/// What was commanded, when (ns) and how far from where the PZT stood (um), and when it was over.
+/// The commands, as time (ns) and offset from the PZT's displacement (um), and the time of the end.
 type Commanded = (Vec<(i64, f64)>, i64);
 
-/// The pulses, on a thread with the rights of the loop's own: a busy machine must neither hold a pulse nor lose frames.
+/// Sends the pulses on a thread with the rights of the control thread, so that a busy machine neither prolongs a pulse nor loses frames.
 fn on_a_thread_of_its_own(
     watch: &mut Watch,
     mover: &mut Mover,
@@ -197,7 +197,7 @@ fn on_a_thread_of_its_own(
     })
 }
 
-/// Waits for a bead that is well in view, then moves the PZT to and fro about where it stands.
+/// Waits for a bead that is well in view, then moves the PZT to and fro about its present displacement.
 fn pulse(
     watch: &mut Watch,
     mover: &mut Mover,
@@ -230,10 +230,10 @@ fn pulse(
     Ok((commands, clock.now_ns()))
 }
 
-/// Longest wait for a bead that is well in view, ms: one that drifts out of view, and the next one that comes in. Then what
-/// there is has to do.
+/// Longest wait for a bead that is well in view, ms: time for one bead to drift out and the next one to come in. After that any bead is
+/// used.
 const FIND_MS: u32 = 8_000;
-/// At least so long, ms.
+/// Shortest wait, ms.
 const SURE_MS: u32 = 100;
 
 /// Whether a bead has just been seen in the middle half of the picture, in some frames in a row.
@@ -326,11 +326,11 @@ fn regress(
     (residual, response)
 }
 
-/// Names a calibration file in a rig file, in place of a table `[calibration]` or of another file. Beside the rig file by its name
-/// alone, so that both can be moved; elsewhere by its whole path.
+/// Names a calibration file in a rig file, and removes a table `[calibration]` or another file's name. A file in the same folder is named
+/// without path, so that both can be moved; any other by its full path.
 ///
 /// # Errors
-/// One of them cannot be read, or the rig file cannot be written.
+/// Either file cannot be read, or the rig file cannot be written.
 pub fn name_in_rig(rig: &Path, calibration: &Path) -> Result<(), Failure> {
     let whole = |path: &Path| path.canonicalize().map_err(Failure::failed);
     let (rig_at, at) = (whole(rig)?, whole(calibration)?);
@@ -352,7 +352,7 @@ mod tests {
 
     #[test]
     fn a_bead_that_goes_with_the_pulses_shows_axis_sign_tilt_and_gain_through_drift() {
-        // 500 frames; gain 4000 px/s per um, up and to the left at 10 degrees from the rows; drift 300 px/s.
+        // 500 frames with a drift of 300 px/s. The gain is 4000 px/s per um, up and to the left at 10 degrees from the rows.
         let tilt = 170_f64.to_radians();
         let (gx, gy) = (4000.0 * tilt.cos(), 4000.0 * tilt.sin());
         let commands: Vec<(i64, f64)> = (0..500)

@@ -1,4 +1,5 @@
-//! Frames of a rig's own camera, kept: in memory for a short look, on disk as a folder of pictures that `cellpos vision` reads.
+//! Records frames of a rig's camera: in memory for a short recording, on disk as a folder of pictures that `cellpos vision`
+//! reads.
 
 use crate::bench::Bench;
 use crate::snapshot::next_frame;
@@ -8,7 +9,7 @@ use image::{ImageBuffer, ImageResult, Luma};
 use serde::Serialize;
 use std::path::Path;
 
-/// Memory for the frames of one look: a gigabyte, a minute of a 64 x 256 px region at 1 kHz.
+/// Memory for the frames of one recording: a gigabyte, or a minute of a 64 x 256 px region at 1 kHz.
 const MOST_BYTES: f64 = (1_u64 << 30) as f64;
 
 /// A frame that was kept.
@@ -46,7 +47,7 @@ pub struct Recorded {
     pub bits: u16,
     /// Pictures in the folder.
     pub frames: usize,
-    /// Frames that the camera exposed and that never came; their numbers are left out in the names.
+    /// Frames that the camera exposed but that never arrived; the file names skip their numbers.
     pub lost: u64,
     /// Frames that came twice.
     pub repeated: u64,
@@ -120,10 +121,10 @@ impl Capture {
         Ok(capture)
     }
 
-    /// Writes the frames into a new folder, one picture a frame, numbered as the camera numbered them.
+    /// Writes the frames into a new folder, one picture per frame, with the camera's numbers.
     ///
     /// # Errors
-    /// The folder is there and not empty, or cannot be written.
+    /// The folder exists and is not empty, or cannot be written.
     pub fn write(&self, folder: &Path) -> Result<Recorded, Failure> {
         let refused = |error: &dyn std::fmt::Display| {
             Failure::bad_input(
@@ -166,10 +167,10 @@ impl Capture {
     }
 }
 
-/// Refuses a folder that holds something: nothing is overwritten.
+/// Refuses a folder that is not empty, so that nothing is overwritten.
 ///
 /// # Errors
-/// It is there and not empty, or it is a file.
+/// It exists and is not empty, or it is a file.
 pub fn new_folder(folder: &Path) -> Result<(), Failure> {
     let refuse = |why: &str| {
         Err(Failure::bad_input(

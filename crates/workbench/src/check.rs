@@ -1,4 +1,4 @@
-//! What does not fit together in a rig file that reads well.
+//! Contradictions within a valid rig file.
 
 pub use crate::connected::{CameraSeen, Connected, connect, of_frames};
 use crate::finding::Found;
@@ -95,7 +95,7 @@ impl Findings<'_> {
         }
     }
 
-    /// A slow actuator whose effect is not known moves nothing.
+    /// The loop does not use a slow actuator of unknown gain.
     fn partner(&mut self) {
         let Some(partner) = &self.file.partner else {
             return;
@@ -127,7 +127,7 @@ impl Findings<'_> {
         }
     }
 
-    /// Watchdogs against the period and against each other.
+    /// Compares the watchdogs with the period and with each other.
     fn watchdogs(&mut self) {
         let period_ms = self.file.timing.period_us * 1e-3;
         let (table, board) = if self.file.actuator.is_emulated() {
@@ -161,7 +161,8 @@ impl Findings<'_> {
         }
     }
 
-    /// Slew against the converter's step, the line against the rate, port and pairing of board and camera.
+    /// Compares the slew with the converter's step, and the line with the rate; checks the port and the pairing of
+    /// board and camera.
     fn board(&mut self) {
         let file = self.file;
         let period_ms = file.timing.period_us * 1e-3;
@@ -281,7 +282,7 @@ impl Findings<'_> {
     }
 }
 
-/// What does not fit together in a file that was read from `path`.
+/// Contradictions within a file that was read from `path`.
 pub fn findings(file: &RigFile, path: &Path) -> Vec<Finding> {
     let mut findings = Findings {
         file,

@@ -1,4 +1,4 @@
-//! What is found when the devices of a rig file are opened.
+//! Opens the devices of a rig file and compares them with it.
 
 use crate::bench::Bench;
 use crate::finding::{Finding, Found, Weight};
@@ -14,11 +14,11 @@ use std::path::Path;
 /// What was found behind the file.
 #[derive(Debug, Clone, Serialize)]
 pub struct Connected {
-    /// The board and its line; none where it could not be opened.
+    /// The board and its line; none if it could not be opened.
     pub board: Option<LineTest>,
-    /// The camera; none where it could not be opened.
+    /// The camera; none if it could not be opened.
     pub camera: Option<CameraSeen>,
-    /// What does not fit to the file.
+    /// Differences from the file.
     pub findings: Vec<Finding>,
 }
 
@@ -33,12 +33,12 @@ pub struct CameraSeen {
     pub rate_hz: f64,
     /// From mid-exposure to arrival, ms.
     pub age_ms: Quantiles,
-    /// From mid-exposure to when vision is through with it, ms, median; none where vision is not set up.
+    /// From mid-exposure to the end of vision's work, ms, median; none if vision is not set up.
     pub used_ms: Option<f64>,
 }
 
-/// Opens board and camera of a rig file that was read from `path`. Nothing moves. One that is not there, or does not answer,
-/// is a finding as well: the other is looked at all the same.
+/// Opens board and camera of a rig file that was read from `path`. Nothing moves. A device that is missing or does not answer is
+/// a finding; the other one is still checked.
 pub fn connect(bench: &Bench, path: &Path) -> Connected {
     let file = bench.file();
     let mut found = Found::in_file(path);
@@ -141,7 +141,7 @@ fn say_failure(found: &mut Found, of: (&str, &str), value: &str, failure: &Failu
     found.say(Weight::Error, of, &value, what, &remedy);
 }
 
-/// Range, slew and park against the board's own; losses on its line.
+/// Compares range, slew and park with the board's own, and counts losses on its line.
 fn judge_board(found: &mut Found, file: &RigFile, line: &LineTest) {
     let (own, info) = (&file.limits, &line.info);
     for (key, value, wider, of_board) in [
@@ -204,9 +204,9 @@ pub fn of_frames(file: &RigFile, seen: &FramesSeen, path: &Path) -> Vec<Finding>
     found.findings
 }
 
-/// Rate and age of the frames against the file.
+/// Compares rate and age of the frames with the file.
 fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
-    /// A rate that is off by less is a camera's own; below, frames are lost.
+    /// A camera may be off by this much; a lower rate means lost frames.
     const KEPT: f64 = 0.1;
     let stated = match &file.camera {
         CameraConfig::Socket { rate_hz, .. } | CameraConfig::Industrial { rate_hz, .. } => {
@@ -254,7 +254,7 @@ fn judge_camera(found: &mut Found, file: &RigFile, camera: &CameraSeen) {
         &FramesSeen {
             rate_hz: camera.rate_hz,
             age_ms: camera.used_ms.or_else(|| {
-                // Before its arrival no frame is used: without vision only that much is known.
+                // A frame cannot be used before it arrives; without vision nothing more is known.
                 let arrived_ms = camera.age_ms.p50;
                 (arrived_ms > file.timing.camera_delay_ms).then_some(arrived_ms)
             }),

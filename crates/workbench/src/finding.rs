@@ -1,4 +1,4 @@
-//! Something in a rig file that does not fit, with its place in the file.
+//! A problem in a rig file, with its position in the file.
 
 use cellpos_session::quantities::line_of;
 use serde::Serialize;
@@ -10,22 +10,22 @@ use std::path::Path;
 pub enum Weight {
     /// It cannot work.
     Error,
-    /// It may work, and should be looked at.
+    /// It may work, but should be checked.
     Warning,
 }
 
-/// Something that does not fit.
+/// A problem.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Finding {
     /// How much it matters.
     pub weight: Weight,
-    /// Line of the key in the file, or of its table where the key is left out; none where neither is there.
+    /// Line of the key in the file, or of its table if the key is left out; none if neither exists.
     pub line: Option<usize>,
     /// The key with its table, as `camera.rate_hz`.
     pub key: String,
     /// Its value, with the unit of the key; empty if missing.
     pub value: String,
-    /// Why it does not fit, with key and value.
+    /// Description of the problem, with key and value.
     pub what: String,
     /// What would be right.
     pub remedy: String,

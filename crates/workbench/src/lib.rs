@@ -1,10 +1,10 @@
-//! Work at the bench, before the loop is closed, and the [`experiment`]s on a rig. Each task at the bench opens the devices of a rig
-//! file without a tracker ([`Bench`]) and leaves the board parked.
+//! Tasks at the bench before the loop is closed, and the [`experiment`]s on a rig. A task at the bench opens the devices of a rig file
+//! without a tracker ([`Bench`]), and parks the board at its end.
 //!
 //! - [`template`] writes a commented rig file, [`check`] compares one with itself and with its devices.
 //! - [`line_test`] measures the line to the board; [`mover`] moves the PZT by hand.
 //! - [`snapshot`] takes a picture, [`capture`] records frames, [`sight`] measures the noise of a position.
-//! - [`beads`] finds the look of the beads, [`calibrate`] axis, sign and scale; [`partner`] the slow actuator.
+//! - [`beads`] finds the settings of vision for the beads, [`calibrate`] axis, sign and scale; [`partner`] writes the slow actuator.
 //! - [`prove`] tests board, camera and vision line by line, [`doctor`] the machine.
 //!
 //! Closed loops are in `cellpos-session`.

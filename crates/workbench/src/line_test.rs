@@ -12,7 +12,7 @@ use std::time::Duration;
 pub struct Quantiles {
     /// Median.
     pub p50: f64,
-    /// 99 in a hundred are below.
+    /// 99 % are below.
     pub p99: f64,
     /// Largest.
     pub max: f64,
@@ -50,7 +50,7 @@ pub struct LineTest {
     pub lost: u32,
     /// Round trip, ms.
     pub round_trip_ms: Quantiles,
-    /// By how much the spacing of pings on the board's own clock differed from a millisecond, ms: jitter of host and line.
+    /// Deviation of the pings' spacing from a millisecond on the board's own clock, ms: jitter of host and line.
     pub jitter_ms: Quantiles,
     /// Frames that the board could not read, since it was switched on.
     pub bad_frames: u32,
@@ -87,7 +87,7 @@ pub fn run(board: &mut Board, count: u32) -> Result<LineTest, Failure> {
             }
             None => lost += 1,
         }
-        // A late answer shifts those after it: the spacing asked for is never less than a period.
+        // A late answer shifts the later pings: the spacing is never below a period.
         due_ns = (due_ns + PERIOD_NS).max(clock.now_ns());
     }
     let jitter_ms = (times_us.windows(2))

@@ -1,4 +1,4 @@
-//! The PZT moved by hand: armed with the rig file's limits, at the user's speed, parked on every way out.
+//! Moves the PZT by hand: within the rig file's limits, at the user's speed. The board is parked on success, error and panic.
 
 use crate::bench::Board;
 use cellpos_control::Limits;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 /// Between two commands, ns.
 const PERIOD_NS: i64 = 1_000_000;
 
-/// A board that is armed and follows; parked when dropped.
+/// An armed board that follows commands; parked on drop.
 pub struct Mover {
     board: Board,
     limits: Limits,
@@ -23,7 +23,7 @@ pub struct Mover {
     at_um: f64,
     session: u16,
     newest: ActuatorReport,
-    /// While it is held, a signal does not end the program before the board is parked.
+    /// While this is held, a signal parks the board before it ends the program.
     _place: Place,
 }
 
@@ -69,8 +69,8 @@ impl Mover {
             clock,
             start_ns: now_ns,
             due_ns: now_ns,
-            // Where it rests may be outside the limits: by a step of the converter, or at a park that the limits leave out. The
-            // board takes no command there.
+            // The PZT may rest outside the limits: by a step of the converter, or at a park displacement that the limits exclude.
+            // The board accepts no command there.
             at_um: newest.applied_um.clamp(limits.low_um, limits.high_um),
             session,
             newest,
@@ -88,13 +88,13 @@ impl Mover {
         self.at_um
     }
 
-    /// The newest that the board has said.
+    /// The board's newest status.
     pub fn newest(&self) -> &ActuatorReport {
         &self.newest
     }
 
-    /// A millisecond: waits for its beginning, steps towards `to_um` by at most `speed_um_per_s`, and reads the board's messages.
-    /// Whether it is there.
+    /// Runs one millisecond: waits for its beginning, steps towards `to_um` at no more than `speed_um_per_s`, and reads the
+    /// board's messages. Returns whether the PZT has arrived.
     ///
     /// # Errors
     /// A displacement outside the limits, a signal to end, a broken line, or a board that is safe or belongs to another host.
@@ -114,12 +114,12 @@ impl Mover {
         }
         self.clock.sleep_until_ns(self.due_ns);
         let now_ns = self.clock.now_ns();
-        // Steps that a stall has cost are not made up for.
+        // Steps that a stall has cost are skipped.
         self.due_ns = (self.due_ns + PERIOD_NS).max(now_ns);
         let reach_um = speed_um_per_s.min(self.limits.slew_um_per_s) * PERIOD_NS as f64 * 1e-9;
         self.at_um += (to_um - self.at_um).clamp(-reach_um, reach_um);
         let time_us = u64::try_from((now_ns - self.start_ns) / 1000).unwrap_or(0);
-        // No bead is followed: where the PZT stands is the best that can be held.
+        // No bead is followed, so the best to hold is the present displacement.
         self.board
             .command(self.at_um, self.at_um, time_us)
             .map_err(Failure::failed)?;
@@ -148,7 +148,7 @@ impl Mover {
 
 impl Drop for Mover {
     fn drop(&mut self) {
-        // What fails here, the board's own watchdog does.
+        // If this fails, the board's own watchdog parks.
         let _ = self.board.disarm();
     }
 }

@@ -1,11 +1,11 @@
-//! What was measured of the slow actuator, written into the table `[partner]` of a rig file.
+//! Writes the measurement of the slow actuator into the table `[partner]` of a rig file.
 
 use crate::rig_text::change;
 use cellpos_session::Failure;
 use std::path::Path;
 use toml_edit::{DocumentMut, value};
 
-/// Writes keys of `[partner]`; everything else of the file, comments too, stays.
+/// Writes keys of `[partner]` and changes nothing else in the file, not even comments.
 ///
 /// # Errors
 /// The file cannot be read or written, or has no such table.
@@ -19,7 +19,7 @@ fn set(document: &mut DocumentMut, keys: &[(&str, f64)]) -> Result<(), String> {
         .and_then(|item| item.as_table_like_mut())
         .ok_or("there is no table [partner]")?;
     for (key, number) in keys {
-        // The same quantity may be there as a text with its unit.
+        // The file may hold the same quantity as a text with its unit.
         let bare = ["_ms", "_um"]
             .iter()
             .find_map(|unit| key.strip_suffix(unit));

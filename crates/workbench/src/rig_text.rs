@@ -1,13 +1,13 @@
-//! Changes to the text of a rig file that leave everything else in it, comments too, as it is.
+//! Changes a part of a rig file's text and nothing else, not even comments.
 
 use cellpos_session::Failure;
 use std::path::Path;
 use toml_edit::DocumentMut;
 
-/// Changes `part` of a rig file. Whoever reads the file meanwhile finds the old one or the new one, whole; a link stays one.
+/// Changes `part` of a rig file. Another reader finds either the whole old file or the whole new one. A link remains a link.
 ///
 /// # Errors
-/// The file cannot be read or written, is no TOML, or `change` refuses. It stays as it was.
+/// The file cannot be read or written, is not TOML, or `change` refuses. It is then unchanged.
 pub(crate) fn change<T>(
     rig: &Path,
     part: &str,

@@ -1,4 +1,4 @@
-//! How well vision sees a bead or a cell in frames that follow each other.
+//! Measures how well vision sees a bead or a cell in successive frames.
 
 use crate::bench::Bench;
 use crate::capture::Kept;
@@ -8,18 +8,18 @@ use cellpos_session::Failure;
 use cellpos_vision::Localiser;
 use serde::Serialize;
 
-/// What the tracker of the loop made of frames.
+/// Result of the loop's tracker on some frames.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Sight {
-    /// Frames, from the first in which it believed in a bead or cell.
+    /// Number of frames since it first accepted a bead or cell.
     pub frames: u64,
     /// Of these, with a position.
     pub seen: u64,
     /// Frames before the first.
     pub before: u64,
-    /// Noise of a position along the rows as the fit states it, median, px.
+    /// Noise of a position along the rows, as stated by the fit, median, px.
     pub stated_px: f64,
-    /// The same from the steps between successive frames, px; none where the bead's own motion hides it.
+    /// The same from the steps between successive frames, px; none if the bead's own motion hides it.
     pub measured_px: Option<f64>,
     /// Contrast over noise, median.
     pub snr: f64,
@@ -31,15 +31,15 @@ impl Sight {
     /// Of frames as the rig file says.
     ///
     /// # Errors
-    /// Settings that cannot be, or a frame of another size than the background of a cell.
+    /// Invalid settings, or a frame of another size than the background of a cell.
     pub fn of(bench: &Bench, frames: &[Kept]) -> Result<Self, Failure> {
         Self::through(&mut Eye::of(bench)?, frames)
     }
 
-    /// Of frames with a bead that another localiser looks for.
+    /// The same for a bead, with another localiser.
     ///
     /// # Errors
-    /// Settings that cannot be.
+    /// Invalid settings.
     pub fn of_bead(bench: &Bench, localiser: Localiser, frames: &[Kept]) -> Result<Self, Failure> {
         Self::through(&mut Eye::of_bead(bench, localiser)?, frames)
     }
@@ -77,8 +77,8 @@ impl Sight {
     }
 }
 
-/// Noise of a position from successive frames. Noise makes successive steps opposite, free motion does not. The blur of the
-/// exposure makes them alike, so this is a lower bound. `None` below twice its uncertainty.
+/// Noise of a position from successive frames. Noise correlates successive steps negatively; free motion does not. The blur of
+/// the exposure correlates them positively, so this is a lower bound. `None` below twice its uncertainty.
 fn noise_px(places: &[(u64, Option<f64>)]) -> Option<f64> {
     let steps: Vec<(f64, f64)> = places
         .windows(3)
@@ -108,7 +108,7 @@ fn noise_px(places: &[(u64, Option<f64>)]) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Steps of a bead that wanders by `walk` a frame, seen with a noise of one, by a generator of numbers of variance one.
+    /// Steps of a bead that wanders by `walk` per frame, with localisation noise 1, from random numbers of variance 1.
     fn noise_of(walk: f64) -> Option<f64> {
         let mut state = 1_u64;
         let mut normal = move || {

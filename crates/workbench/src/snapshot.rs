@@ -11,10 +11,10 @@ use std::path::Path;
 
 /// How long a frame may let wait, ns.
 const PATIENCE_NS: i64 = 2_000_000_000;
-/// How long a bead or cell is looked for, ns: one that was lost is followed by the next.
+/// Longest search for a bead or cell, ns: after a lost one the next may come.
 const LOOKING_NS: i64 = 5_000_000_000;
 
-/// What was seen in the frame that was kept.
+/// Result of the frame that was kept.
 #[derive(Debug, Clone, Serialize)]
 pub struct Snapshot {
     /// Which camera.
@@ -26,7 +26,7 @@ pub struct Snapshot {
     /// Darkest and brightest pixel, and full scale, grey levels: light and gain are well set when the brightest stays below
     /// full scale.
     pub grey: [u16; 3],
-    /// Bead or cell, if it was looked for and seen.
+    /// Bead or cell, if requested and seen.
     pub seen: Option<Seen>,
 }
 
@@ -41,7 +41,7 @@ pub struct Seen {
     pub half_px: f64,
     /// Contrast over noise.
     pub snr: f64,
-    /// Standard deviation of the column as the fit states it, px.
+    /// Standard deviation of the column, as stated by the fit, px.
     pub sd_px: f64,
     /// Position along the channel, um; none without a calibration.
     pub position_um: Option<f64>,
@@ -66,7 +66,7 @@ pub fn next_frame(camera: &mut dyn Camera, buffer: &mut FrameBuffer) -> Result<i
 /// Takes a frame; with `overlay` the first in which a bead or cell is seen, if one is within five seconds.
 ///
 /// # Errors
-/// No frame comes, or what vision needs is missing.
+/// No frame comes, or a setting that vision needs is missing.
 pub fn take(bench: &Bench, overlay: bool) -> Result<(Snapshot, RgbImage), Failure> {
     let mut camera = bench.camera()?;
     let mut buffer = FrameBuffer::default();
@@ -107,7 +107,7 @@ impl Eye {
     /// As the rig file describes it.
     ///
     /// # Errors
-    /// Settings that cannot be; no background for a cell.
+    /// Invalid settings; no background for a cell.
     pub fn of(bench: &Bench) -> Result<Self, Failure> {
         let file = bench.file();
         if file.follows_a_cell() {
@@ -119,10 +119,10 @@ impl Eye {
         }
     }
 
-    /// A bead that another localiser looks for.
+    /// Finds a bead with another localiser.
     ///
     /// # Errors
-    /// Settings of the tracker that cannot be.
+    /// Invalid settings of the tracker.
     pub fn of_bead(bench: &Bench, localiser: Localiser) -> Result<Self, Failure> {
         let tracker = Tracker::new(localiser, tracker_config(bench)).map_err(Failure::input)?;
         Ok(Self::Bead(Box::new(tracker), bench.file().calibration))
@@ -165,7 +165,7 @@ impl Eye {
 }
 
 fn tracker_config(bench: &Bench) -> TrackerConfig {
-    /// Of a bead of 1 um under an objective of 100 times, before anything is calibrated, um.
+    /// Pixel size assumed before a calibration, for a bead of 1 um under a 100x objective, um.
     const USUAL_PIXEL_UM: f64 = 0.1;
     let file = bench.file();
     let pixel_um = file.calibration.map_or(USUAL_PIXEL_UM, |c| c.pixel_um);
@@ -203,7 +203,7 @@ pub(crate) fn picture(buffer: &FrameBuffer) -> RgbImage {
     })
 }
 
-/// A square around what is seen, and a cross at its centre.
+/// A square around the object, and a cross at its centre.
 pub(crate) fn mark(picture: &mut RgbImage, seen: &Seen) {
     const COLOUR: Rgb<u8> = Rgb([255, 64, 0]);
     let (x, y, half) = (
@@ -267,8 +267,8 @@ pub fn line_spacing(path: &Path) -> Result<(f64, f64), Failure> {
         })
 }
 
-/// Spacing of the lines of a profile, and its standard deviation: a fit of the lines' places (centroids of the pixels darker or
-/// brighter than the middle) against their numbers.
+/// Spacing of the lines of a profile, and its standard deviation. A straight line is fitted to the lines' places (centroids of
+/// the pixels darker or brighter than the middle) against their numbers.
 fn spacing(profile: &[f64]) -> Option<(f64, f64)> {
     let n = profile.len() as f64;
     let mean = profile.iter().sum::<f64>() / n;
@@ -306,7 +306,7 @@ fn spacing(profile: &[f64]) -> Option<(f64, f64)> {
         .map(|(k, x)| (x - centre - slope * (k as f64 - middle)).powi(2))
         .sum();
     let sd = (residual / (count - 2.0) / numbers).sqrt();
-    // Lines that do not follow each other evenly are no micrometre.
+    // Unevenly spaced lines are not a stage micrometre.
     (sd * numbers.sqrt() < 0.1 * slope).then_some((slope, sd))
 }
 

@@ -1,4 +1,4 @@
-//! A rig file to begin with: commented, and with what this machine offers.
+//! A first rig file: commented, with the devices that this machine offers.
 
 use std::path::Path;
 
@@ -70,7 +70,7 @@ pub struct Found {
     pub cameras: Vec<String>,
 }
 
-/// What was found, as comments.
+/// The devices found, as comments.
 fn list(what: &str, found: &[String]) -> String {
     if found.is_empty() {
         return format!("# {what} found on this machine: none\n");

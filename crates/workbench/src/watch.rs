@@ -1,7 +1,7 @@
-//! A camera and what is seen in its frames, while something else must not be kept waiting.
+//! A camera and its tracker, for a thread that must not wait.
 //!
-//! To look at a frame can take longer than there is time between two commands. Frames are put aside as they come and looked at
-//! when there is time: none is lost, and no command is late.
+//! Vision can take longer than the time between two commands. Frames are therefore stored when they come and evaluated when there
+//! is time: none is lost, and no command is late.
 
 use crate::bench::Bench;
 use crate::snapshot::Eye;
@@ -17,7 +17,7 @@ pub(crate) struct Sighting {
     pub(crate) y_px: f64,
 }
 
-/// Camera, eye and the frames that were put aside.
+/// Camera, tracker and the stored frames.
 pub(crate) struct Watch {
     camera: Box<dyn Camera>,
     eye: Eye,
@@ -31,7 +31,7 @@ pub(crate) struct Watch {
 
 /// Frames that are taken at once.
 const AT_ONCE: usize = 100;
-/// Memory for frames that were put aside; beyond it they are looked at when they come.
+/// Memory for stored frames; beyond it, frames are evaluated when they come.
 const MOST_BYTES: usize = 1 << 29;
 
 impl Watch {
@@ -53,7 +53,7 @@ impl Watch {
         [self.buffer.width, self.buffer.height]
     }
 
-    /// Looks at the newest few of the frames that have come, and forgets the others.
+    /// Evaluates the newest few of the frames that have come, and forgets the others.
     pub(crate) fn glance(&mut self) -> Result<(), Failure> {
         const NEWEST: usize = 2;
         self.put_aside()?;
@@ -63,7 +63,7 @@ impl Watch {
         self.look_at_all()
     }
 
-    /// Puts aside the frames that have come.
+    /// Stores the frames that have come.
     pub(crate) fn put_aside(&mut self) -> Result<(), Failure> {
         let now_ns = Clock::Real.now_ns();
         for _ in 0..AT_ONCE {
@@ -77,8 +77,7 @@ impl Watch {
         Ok(())
     }
 
-    /// Waits for the frames that were exposed up to `until_ns`, looks at all that were put aside and gives what was seen in
-    /// them.
+    /// Waits for the frames exposed up to `until_ns`, evaluates all stored frames and returns the beads seen in them.
     pub(crate) fn finish(mut self, until_ns: i64) -> Result<Vec<Sighting>, Failure> {
         const PATIENCE_NS: i64 = 200_000_000;
         while self.aside.back().is_none_or(|(at_ns, _)| *at_ns < until_ns) {
@@ -91,7 +90,7 @@ impl Watch {
         Ok(self.sightings)
     }
 
-    /// Puts one frame aside, if one comes until then.
+    /// Stores one frame, if one comes until then.
     fn next(&mut self, deadline_ns: i64) -> Result<bool, Failure> {
         let stamp = self.camera.next_frame(&mut self.buffer, deadline_ns);
         let Some(stamp) = stamp.map_err(Failure::failed)? else {

@@ -1,4 +1,4 @@
-//! What of the machine spoils a 1 kHz loop, and which line to change.
+//! Properties of the machine that spoil a 1 kHz loop, and the line to change for each.
 
 use serde::Serialize;
 use std::path::Path;
@@ -9,13 +9,13 @@ use std::path::Path;
 pub enum Weight {
     /// As it should be.
     Good,
-    /// May cost some microseconds, or a run under other circumstances.
+    /// May cost some microseconds, or spoil a run under other conditions.
     Note,
     /// Will cost ticks.
     Bad,
 }
 
-/// One thing that was looked at.
+/// One property that was examined.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Finding {
     /// What was looked at.
@@ -24,7 +24,7 @@ pub struct Finding {
     pub found: String,
     /// How bad it is.
     pub weight: Weight,
-    /// The line to change; none where all is well or nothing can be done.
+    /// The line to change; none if all is well or nothing can be done.
     pub change: Option<String>,
 }
 
@@ -51,7 +51,7 @@ fn finding(
     }
 }
 
-/// The files that tell: below `/` on a machine, below a folder in a test.
+/// The system files to read: below `/` on a machine, below a folder in a test.
 pub(super) struct Machine<'p> {
     /// What stands for `/`.
     pub root: &'p Path,
@@ -312,7 +312,7 @@ impl Machine<'_> {
         })
     }
 
-    /// Whether serial ports that are there may be opened.
+    /// Whether the user may open the existing serial ports.
     pub(super) fn serial_ports(&self) -> Option<Finding> {
         let ports: Vec<std::path::PathBuf> = self
             .entries("/dev")

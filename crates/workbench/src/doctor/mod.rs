@@ -1,4 +1,4 @@
-//! Whether this machine is fit for a 1 kHz loop: the timer measured, the machine looked at, a verdict.
+//! Decides whether this machine is fit for a 1 kHz loop: measures the timer, examines the machine, gives a verdict.
 
 mod findings;
 mod soak;
@@ -19,23 +19,23 @@ use std::time::Duration;
 /// The examination of a machine.
 #[derive(Debug, Serialize)]
 pub struct Examination {
-    /// Fit for 1 kHz, as far as was measured.
+    /// Fit for 1 kHz, as far as measured.
     pub fit: bool,
     /// The verdict in words.
     pub verdict: String,
     /// How late the timer woke a thread with the control thread's rights.
     #[serde(flatten)]
     pub soak: Soak,
-    /// What of the machine was looked at.
+    /// The examined properties of the machine.
     pub findings: Vec<Finding>,
 }
 
-/// Shortest measurement that is called fit, s: a stall that comes once a second must have had its chance.
+/// Shortest measurement that can call a machine fit, s: a stall that occurs once a second must have had its chance.
 const SHORTEST_S: f64 = 2.0;
 
-/// Asks for everything that the control thread asks for, measures the timer for `duration` or until `stop` is raised, and looks at
-/// the machine: its ports, and the room in a folder of runs for a run of so many seconds, if one is given. `why`: name the programs
-/// that delayed a wake-up.
+/// Requests the same rights as the control thread, and measures the timer for `duration` or until `stop` is raised. Then it examines the
+/// machine: its ports and, if a run's folder and duration are given, the room on the disk for it. `why`: name the programs that delayed a
+/// wake-up.
 ///
 /// # Errors
 /// The measuring thread could not be started.

@@ -1,4 +1,4 @@
-//! A bare loop at 1 kHz, and the programs that ran when it was late.
+//! Runs a bare loop at 1 kHz, and names the programs that ran when it was late.
 
 use super::suspect::Suspect;
 use super::traced::{LateWindows, Tracing};
@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A wake-up later than this is one to be explained, ns: a fifth of the period.
+/// Wake-ups later than this are explained, ns: a fifth of the period.
 pub const LATE_NS: u64 = 200_000;
 
 /// What the loop measured.
@@ -27,14 +27,14 @@ pub struct Soak {
     pub late: u64,
     /// Periods that were missed altogether.
     pub missed: u64,
-    /// What ran while a wake-up was late; empty unless asked for. By the kernel's own record, who had the loop's CPU in that
-    /// very time; without it, what ran on the machine in that tenth of a second.
+    /// The programs that ran while a wake-up was late; empty unless requested. With the kernel's record: those on the loop's CPU
+    /// at that time. Without: those on the machine in that tenth of a second.
     pub suspects: Vec<Suspect>,
-    /// How far the naming went, in a sentence; none unless asked for.
+    /// How complete these names are, in a sentence; none unless requested.
     pub why: Option<String>,
 }
 
-/// Runs the loop, until `stop` is raised. `why`: whether to look at what else runs (ten looks a second, at low priority).
+/// Runs the loop, until `stop` is raised. `why`: whether to watch the other programs (ten times a second, at low priority).
 pub(super) fn soak(
     request: Request,
     duration: Duration,
@@ -133,7 +133,7 @@ fn snapshot(cpu: Option<usize>) -> BTreeMap<String, (f64, &'static str)> {
             None => counts.iter().sum(),
         };
         let device = rest.get(counts.len()..).unwrap_or(&[]).join(" ");
-        // The timer that wakes the loop comes a thousand times a second and is no suspect.
+        // The timer that wakes the loop fires a thousand times a second; it is not a suspect.
         if !device.contains("timer") {
             all.insert(
                 format!("interrupt {number} {device}"),
@@ -209,7 +209,7 @@ fn watch(late: &AtomicU64, done: &AtomicBool, cpu: Option<usize>) -> Vec<Suspect
     suspects
 }
 
-/// What is left without the kernel's record, and how to have it.
+/// The limit of naming without the kernel's record, and how to get the record.
 fn tracing(error: &str) -> String {
     format!(
         "these programs ran within the same tenth of a second; which one had the CPU is unknown: {error}"

@@ -1,4 +1,4 @@
-//! What is named when a wake-up was late.
+//! The processes and interrupts named for late wake-ups.
 
 use serde::Serialize;
 

@@ -1,18 +1,18 @@
-//! Who had the CPU while the loop waited for it, from the kernel's own record of every switch: named to the microsecond.
+//! Names who had the CPU while the loop waited for it, to the microsecond, from the kernel's own record of every switch.
 //!
-//! A separate trace instance (a ring in the kernel's memory) records `sched_switch` and `irq_handler_entry` during the measurement
-//! and is removed afterwards. Other tracing is not touched. It needs root and a mounted tracefs.
+//! A separate trace instance (a ring in the kernel's memory) records `sched_switch` and `irq_handler_entry` during the
+//! measurement, and is removed afterwards. It does not affect other tracing. It needs root and a mounted tracefs.
 
 use super::suspect::Suspect;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicI64, Ordering};
 
-/// Late wake-ups that wait for evaluation, ten times a second.
+/// Capacity for late wake-ups between two evaluations, which are a tenth of a second apart.
 const WAITING: usize = 128;
 
-/// Late wake-ups, handed over without a lock: from the due time to the wake-up, ns of the monotonic clock. When it is full,
-/// or two are written at once, one is forgotten.
+/// Late wake-ups, handed over without a lock: from the due time to the wake-up, ns of the monotonic clock. If it is full, or two
+/// are written at once, one is lost.
 pub(super) struct LateWindows {
     from_ns: [AtomicI64; WAITING],
     to_ns: [AtomicI64; WAITING],
@@ -35,7 +35,7 @@ impl LateWindows {
         self.to_ns[place].store(now_ns, Ordering::Release);
     }
 
-    /// Those that came since the last call.
+    /// The late wake-ups since the last call.
     fn take(&self) -> Vec<(i64, i64)> {
         let each = self.from_ns.iter().zip(&self.to_ns);
         each.filter_map(|(from, to)| {
@@ -46,7 +46,7 @@ impl LateWindows {
     }
 }
 
-/// The trace instance; it goes away when dropped.
+/// The trace instance; removed on drop.
 pub(super) struct Tracing {
     folder: PathBuf,
     cpu: Option<usize>,
@@ -92,12 +92,12 @@ impl Tracing {
         set("trace_clock", "mono")?;
         set("buffer_size_kb", "512")?;
         set("events/sched/sched_switch/enable", "1")?;
-        // A kernel without it still has the switches.
+        // A kernel without this event still records the switches.
         let _ = set("events/irq/irq_handler_entry/enable", "1");
         Ok(tracing)
     }
 
-    /// Looks at the late wake-ups that came since the last look.
+    /// Evaluates the late wake-ups since the last call.
     pub(super) fn look(&mut self, windows: &LateWindows) {
         let late = windows.take();
         if late.is_empty() {
@@ -136,7 +136,7 @@ impl Tracing {
     }
 }
 
-/// Instances of processes that were killed: they would listen for ever.
+/// Removes instances of killed processes: they would record forever.
 fn remove_left_behind(instances: &Path) {
     for entry in std::fs::read_dir(instances).into_iter().flatten().flatten() {
         let name = entry.file_name();
@@ -232,7 +232,7 @@ fn shares(runs: &[OnCpu], (from_ns, to_ns): (i64, i64)) -> BTreeMap<String, (f64
         match run.to_ns {
             Some(end_ns) => {
                 let ns = end_ns.min(to_ns) - run.from_ns.max(from_ns);
-                // The measuring thread itself comes on in the last microseconds.
+                // The measuring thread itself runs in the last microseconds.
                 if ns > 0 && !run.name.starts_with("cellpos-doctor ") {
                     all.entry(run.name.clone()).or_insert((0.0, "ms")).0 += ns as f64 * 1e-6;
                 }
@@ -274,7 +274,7 @@ mod tests {
             3,
             "the measuring thread is nobody's suspect: {found:?}"
         );
-        // A time that the record no longer has is not explained by who runs later.
+        // If the record no longer covers a time, later entries do not explain it.
         assert!(shares(&runs, (ns(29_700.0), ns(29_700.5))).is_empty());
     }
 

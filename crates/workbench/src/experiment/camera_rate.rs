@@ -1,15 +1,15 @@
-//! Whether the camera gives a frame in each period of the loop.
+//! Checks that the camera gives one frame in each period of the loop.
 //!
-//! A record has a row per frame, and the loop's clock plays its excitation: with a camera of another rate every frequency would be wrong.
+//! A record has a row per frame, but the loop's clock plays the excitation. With a camera of another rate every frequency would be wrong.
 
 use cellpos_runtime::{TickFlags, TickRecord};
 use cellpos_session::Failure;
 
-/// Frames in a window: the stamps of two frames may be off by a tenth of a period each.
+/// Frames in a window: long enough that stamps off by a tenth of a period do not matter.
 const WINDOW: u64 = 500;
-/// Windows for the decision: in one the camera may have restarted without counting lost frames.
+/// Windows for the decision: in one of these, the camera may have restarted without counting lost frames.
 const WINDOWS: usize = 3;
-/// What is agreed to: a crystal is off by 0.01 %.
+/// Accepted relative difference: a crystal is off by 0.01 %.
 const AGREES: f64 = 1e-3;
 
 /// Frames per second by the stamps of the camera, if it differs from one per period of the loop; `None` if it is, or not known yet.
@@ -46,7 +46,7 @@ pub(crate) struct InPeriods {
 }
 
 impl InPeriods {
-    /// `None` where the camera gives at most one frame a period.
+    /// `None` if the camera gives at most one frame per period.
     pub(crate) fn of(rate_hz: f64, period_ns: i64) -> Option<Self> {
         /// Frames a period: halfway between one and two.
         const SEVERAL: f64 = 1.5;
@@ -69,7 +69,7 @@ impl InPeriods {
     }
 }
 
-/// That in a sentence, and what to do.
+/// The difference in a sentence, and what to do.
 pub(crate) fn other_rate(rate_hz: f64, period_ns: i64) -> Failure {
     Failure::bad_input(
         format!(

@@ -1,5 +1,5 @@
-//! `cellpos reconcile --collect`: runs the experiment that would decide, on the rig, through the loop of `cellpos track`,
-//! adds its record to the data, and looks again.
+//! `cellpos reconcile --collect`: runs the deciding experiment on the rig, through the loop of `cellpos track`, adds its record to the
+//! data and reconciles again.
 
 use crate::experiment::excitation::Experiment;
 use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
@@ -11,7 +11,7 @@ use cellpos_session::connect::stated_exposure_s;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// A verdict that could not be reached, as a failure.
+/// Converts the error of a failed verdict to a failure.
 pub fn refused(error: ReconcileError) -> Failure {
     Failure::bad_input(
         error,
@@ -28,11 +28,11 @@ pub struct Collected {
     pub what: &'static str,
     /// Why it was run.
     pub why: String,
-    /// Where its record lies, ready for `--data`.
+    /// Path of its record, ready for `--data`.
     pub file: PathBuf,
     /// Rows of the record.
     pub rows: usize,
-    /// Of these, rows without a bead: not seen, or its frame came too late for its row.
+    /// Rows without a bead: not seen, or its frame came too late for its row.
     pub rows_without_bead: usize,
     /// Verdict with it.
     pub verdict: String,
@@ -57,7 +57,7 @@ pub struct Collecting<'a> {
 pub struct Ran {
     /// The record.
     pub record: Record,
-    /// Displacement at which the bead rests, um: where a bead is held, the mean of what was commanded.
+    /// Displacement at which the bead rests, um: for a held bead the mean command.
     pub neutral_um: f64,
     /// From the middle of an exposure to the tick that used it, s.
     pub age_s: f64,
@@ -148,7 +148,7 @@ fn record(
     Ok(record)
 }
 
-/// Mean command of a held bead, less what moved the bead from where it was to where it came. The loop's own estimate follows
+/// Mean command of a held bead, minus the part that moved the bead from its first to its last position. The loop's own estimate follows
 /// Brownian motion, and an error of 4 nm would look like a drift of 1.7 um/s.
 pub fn neutral_um(record: &Record, gain_per_s: f64) -> f64 {
     let mean_um = record.pzt_um.iter().sum::<f64>() / record.rows().max(1) as f64;
@@ -196,7 +196,7 @@ pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
     table.write(path).map_err(Failure::failed)
 }
 
-/// What to run next, and why; `None` when nothing would help.
+/// The next experiment, and why; `None` if none would help.
 fn next(result: &Result<Reconciliation, ReconcileError>) -> Option<(Experiment, String)> {
     match result {
         Ok(r) if r.verdict == Verdict::Ambiguous => r.effects.iter().find_map(|e| {
@@ -221,8 +221,8 @@ fn next(result: &Result<Reconciliation, ReconcileError>) -> Option<(Experiment, 
     }
 }
 
-/// Looks, and collects and looks again while that would help. `model.working_point_um` becomes the neutral that the loop
-/// found where no record comes near it.
+/// Reconciles, then collects and reconciles again while that helps. If no record comes near `model.working_point_um`, it becomes the
+/// neutral that the loop found.
 pub fn look(
     model: &mut Model,
     records: &mut Vec<Record>,
@@ -243,7 +243,7 @@ pub fn look(
         }
         let wanted = next(&result)
             .filter(|_| collected.len() < collecting.rounds)
-            // What was run and did not decide will not decide now: a longer record may.
+            // The same experiment would not decide now either; a longer record may.
             .map(|(e, why)| {
                 if done.contains(&e) {
                     (Experiment::Long, why)
@@ -283,8 +283,8 @@ pub fn look(
     }
 }
 
-/// The bead rests where the loop found it to rest, if the model was made at another place. Whether it was: the place is then no better
-/// known than the loop found it.
+/// If the model was made at another working point, uses the one that the loop found. Returns whether it did: the working point is then
+/// known only as well as the loop found it.
 pub fn at_rest(model: &mut Model, record: &Record, neutral_um: f64) -> bool {
     let (low, high) = record.pzt_range_um();
     let elsewhere = !(low..=high).contains(&model.working_point_um);
@@ -294,7 +294,7 @@ pub fn at_rest(model: &mut Model, record: &Record, neutral_um: f64) -> bool {
     elsewhere
 }
 
-/// A file that is not there yet: nothing is overwritten.
+/// The path of a new file, so that nothing is overwritten.
 fn free_name(folder: &Path, experiment: Experiment) -> PathBuf {
     (1..)
         .map(|n| folder.join(format!("{}-{n}.csv", experiment.name())))

@@ -1,12 +1,12 @@
-//! What `cellpos reconcile --collect` says of an emulated rig that hides one effect: values and intervals against the truth.
+//! Verdicts of `cellpos reconcile --collect` on an emulated rig that hides one effect: values and intervals against the truth.
 //!
 //!     cargo test -p cellpos-workbench --lib table_of_hidden_effects -- --ignored --nocapture
 //!
 //! `HIDDEN=leak` runs the rows whose id contains it, `SEEDS=5` the seeds 1 to 5 (2 without it), `FIRST=100` the seeds from 100 on.
 //! `KEEP=DIR` keeps the collected records there and, if they are there already, reconciles these in place of a new collection.
 //!
-//! Every seed is another rig: its zero flow wanders by 2 to 20 nm in 5 to 50 s and drifts by up to 5 nm/s, its camera's clock is 15 ppm off
-//! either way and stalls now and then, light and focus differ.
+//! Every seed is a different rig. Its zero flow wanders by 2 to 20 nm in 5 to 50 s and drifts by up to 5 nm/s. Its camera's clock is up
+//! to 15 ppm off and stalls now and then. Light and focus differ.
 
 use super::{Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, at_rest, look, neutral_um, refused};
 use crate::experiment::on_rig::OnRig;
@@ -119,7 +119,7 @@ fn rows() -> Vec<Row> {
     ]
 }
 
-/// A dirty rig of its own for every seed.
+/// A different imperfect rig for every seed.
 fn rig_of(seed: u64, model: String) -> WorldConfig {
     let mut random = Random::stream(seed, 77);
     let mut between = |low: f64, high: f64| low * (high / low).powf(random.uniform());
@@ -186,7 +186,7 @@ fn kept(folder: &Path) -> Vec<Record> {
         .collect()
 }
 
-/// Reconciles what an earlier run kept.
+/// Reconciles the records of an earlier run.
 fn again(records: &[Record]) -> Result<Reconciliation, Failure> {
     let mut model = Model::eq6();
     let mut options = Options::default();
@@ -265,7 +265,8 @@ fn table_of_hidden_effects() {
     );
 }
 
-/// Prints a row. Whether it is right: the delay and what is hidden are named, nothing else, with the truth inside every interval.
+/// Prints a row. True if the verdict is right: it names the delay and the hidden effect, nothing else, and every interval contains the
+/// truth.
 fn row(id: &str, truth: &[(&str, f64)], seed: u64, r: &Reconciliation) -> bool {
     let mut right = r.verdict.word().starts_with("named");
     println!("{id:<16} {seed:>2}  {}", r.verdict.word());

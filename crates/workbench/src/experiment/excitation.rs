@@ -1,7 +1,7 @@
-//! Experiments that tell effects apart: excitations added to the command of a held bead.
+//! Experiments that separate effects: excitations added to the command of a held bead.
 //!
-//! Which one is wanted follows from the names that the records leave open. All keep the bead in view and run unattended; experiments
-//! that need hands (another bead, the fluid disconnected) are not here.
+//! The names that the records leave open decide which one is needed. All keep the bead in view and run unattended. Experiments that need
+//! a person (another bead, the fluid disconnected) are not here.
 
 use crate::experiment::on_rig::OnRig;
 use cellpos_ident::excitation::{Signal, Tone};
@@ -11,7 +11,7 @@ use cellpos_session::Failure;
 /// One experiment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Experiment {
-    /// Band, amplitudes and a rest, where there is nothing yet.
+    /// The first record: a band, amplitudes and a rest.
     Survey,
     /// Lines from 2 Hz to near half the rate at once.
     Band,
@@ -35,7 +35,7 @@ const BAND_HZ: [f64; 14] = [
 const BEAD_UM_PER_S: f64 = 250.0;
 
 impl Experiment {
-    /// The experiment that tells an effect from the others that would do; `None`: no excitation does.
+    /// The experiment that separates an effect from its alternatives; `None`: no excitation does.
     pub fn separating(id: &str, alternatives: &[String]) -> Option<Self> {
         let among = |names: &[&str]| {
             std::iter::once(id)
@@ -97,8 +97,7 @@ impl Experiment {
         }
     }
 
-    /// The segments, for a rig and the model that it is believed to be, measured for `share` of the usual time. `seed` fixes
-    /// the phases.
+    /// The segments for a rig and its assumed model, measured for `share` of the usual time. `seed` fixes the phases.
     pub fn plan(self, rig: &OnRig, share: f64, seed: u64) -> Result<Plan, Failure> {
         let setup = rig.bench_setup();
         let expected = setup.expected()?;

@@ -1,4 +1,4 @@
-//! Where the ticks of an identification go: to whoever waits for them, and into the run folder.
+//! The sink for the ticks of an identification: passes them to the waiting thread and into the run folder.
 
 use cellpos_ident::experiment::Span;
 use cellpos_record::RunWriter;
@@ -8,13 +8,13 @@ use cellpos_session::recording::Recording;
 use cellpos_session::view::{Shown, State};
 use std::sync::mpsc::Sender;
 
-/// Hands every tick on, to whoever waits for the run, and to the run folder.
+/// Passes every tick to the thread that waits for the run, and to the run folder.
 pub(crate) struct Handing {
     recording: Recording,
     ticks: Sender<TickRecord>,
     /// The segments, by ticks since the first segment.
     spans: Vec<Span>,
-    /// The tick in which the loop was closed, and the newest.
+    /// The tick in which the loop was closed, and the newest tick.
     closed: Option<u64>,
     newest: u64,
     period_s: f64,

@@ -1,5 +1,4 @@
-//! Experiments on a rig: an identification, records for reconcile, and the whole circle of identify, reconcile, design and
-//! track.
+//! Experiments on a rig: identification, records for reconcile, and the whole circle of identify, reconcile, design and track.
 //!
 //! - [`identify`]: the whole identification, on the emulated rig or on yours ([`on_rig`]).
 //! - [`collect`]: the experiments that reconcile needs. [`excitation`]: their signals.

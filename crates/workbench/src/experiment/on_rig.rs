@@ -1,7 +1,7 @@
 //! An identification on the rig of a rig.toml, through the same loop, threads and safe states as `cellpos track`. The bead is
 //! held at 0 um and the excitation is added to the command.
 //!
-//! The loop freezes and thaws by its own rules when the bead is lost; a segment in which it did is measured again.
+//! If the bead is lost, the loop freezes and thaws by its own rules, and the segment is measured again.
 
 use crate::experiment::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
 use crate::experiment::exciting::Handing;
@@ -27,40 +27,39 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// A rig and the loop to hold a bead on it with.
+/// A rig, and the loop that holds a bead on it.
 #[derive(Debug, Clone)]
 pub struct OnRig {
     /// The rig.
     pub file: RigFile,
-    /// The plant that the controller believes in.
+    /// The plant that the controller assumes.
     pub model: Model,
     /// The controller.
     pub controller: ControllerFile,
-    /// Which clock (an emulated rig may run on either).
+    /// The clock (an emulated rig may run on either).
     pub clock: ClockKind,
     /// Frames or positions (emulated rig).
     pub frames: Frames,
     /// Do not ask the operating system for real time.
     pub best_effort: bool,
-    /// Below which folder each run leaves its own; `None`: none is kept.
+    /// Parent of the run folders; `None`: runs are not kept.
     pub record_in: Option<PathBuf>,
 }
 
 /// What a run gave.
 pub struct Acquired {
-    /// Segments in which the bead was never lost for long.
+    /// The segments without a long loss of the bead.
     pub records: Vec<RecordedSegment>,
     /// Estimate of neutral at the end, um.
     pub neutral_um: f64,
     /// Mean time from the middle of an exposure to the tick that used it, by the stamps of the frames, s; without frames that a
     /// stall delayed. `None` before the first.
     pub age_s: Option<f64>,
-    /// Localisation noise as vision stated it, um RMS.
+    /// Localisation noise that vision reported, um RMS.
     pub fix_noise_um: Option<f64>,
-    /// The whole run from where the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN
-    /// without one.
+    /// The whole run since the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN without one.
     pub rows: (Vec<f64>, Vec<f64>),
-    /// Its rows whose frame came, but showed no bead to be trusted.
+    /// Number of rows whose frame came but showed no reliable bead.
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,
@@ -73,9 +72,9 @@ pub struct Acquired {
 /// Why segments are missing.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Trouble {
-    /// The run ended before its time: another one would end like it, until something is done.
+    /// The run ended early, and a repetition would too until something is done.
     Ended(Ended),
-    /// In some the bead was lost for long; a repetition may be complete.
+    /// Some lost the bead for long; a repetition may be complete.
     Spoilt {
         /// How many.
         missing: usize,
@@ -121,7 +120,7 @@ impl OnRig {
         });
         let model = file.actuator.before(model);
         let mut controller = setup::controller("pi", &model, &file.timing)?;
-        // The rig's own limits alone: a controller's narrower ones are for holding, not for driving.
+        // Only the rig's own limits apply: the narrower ones of a controller are for holding, not for an excitation.
         controller.limits = file.limits;
         Ok(Self {
             file,
@@ -162,8 +161,8 @@ impl OnRig {
 
     /// Amplitudes that keep the bead in view, its image sharp and the board within its slew.
     pub fn limits(&self, bead_um: f64, bead_um_per_s: f64, pzt_um: f64) -> ShapeLimits {
-        // The board follows a step within its first update of 0.1 ms if the slew lets it (4 um at 40 um/ms); a larger one
-        // would be late by more, and bend the drive. A fifth is left to the loop that holds the bead.
+        // The board follows a step within its first update of 0.1 ms if the slew permits (4 um at 40 um/ms). A larger step would
+        // take longer and distort the excitation. A fifth is reserved for the loop that holds the bead.
         ShapeLimits {
             bead_um,
             bead_um_per_s,
@@ -205,10 +204,10 @@ impl OnRig {
         listener: &mut Listener<'_>,
         pages: Option<&mut Pages>,
     ) -> Result<Acquired, Failure> {
-        /// How often the ticks are looked at.
+        /// Interval between two checks of the ticks.
         const LOOK_EVERY: Duration = Duration::from_millis(100);
         let schedule = plan.schedule(todo);
-        // What is measured here is the PZT's: a slow partner stays parked.
+        // This measures the PZT: a slow partner stays parked.
         let mut file = self.file.clone();
         file.partner = None;
         let mut rig = Rig::open(file, self.options())?;
@@ -314,7 +313,7 @@ impl OnRig {
         Ok(Some(writer))
     }
 
-    /// What the ticks so far hold.
+    /// The result of the ticks so far.
     fn acquired(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span]) -> Acquired {
         let rows = self.rows(ticks);
         let records = spans
@@ -340,7 +339,7 @@ impl OnRig {
         Rows::of(ticks, self.file.timing.period_ns())
     }
 
-    /// The first segment that is spoilt, and what spoilt it.
+    /// The first invalid segment, and the reason.
     fn first_spoilt(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span]) -> String {
         let rows = self.rows(ticks);
         let first = spans.iter().find_map(|span| {
@@ -352,7 +351,7 @@ impl OnRig {
         first.unwrap_or_default()
     }
 
-    /// The LED test on a rig with a real board: its LED is switched at dithered instants before its camera.
+    /// The LED test on a rig with a real board, which switches its LED at dithered instants in front of the camera.
     pub fn delay_test(&self, edges: usize, seed: u64) -> Result<DelayTest, Failure> {
         const APART_S: f64 = 0.011;
         const PINGS: u32 = 21;

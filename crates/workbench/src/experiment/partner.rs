@@ -1,9 +1,9 @@
-//! The slow partner of the PZT, measured: its gain, lag and delay, each with its interval.
+//! Measures the slow partner of the PZT: gain, lag and delay, each with an interval.
 //!
-//! The loop holds a bead with the PZT while the partner makes a square wave that the loop is not told of. The partner causes the
-//! motion that the PZT does not explain: its command through a lag and a delay, times the gain, into the same plant. The command
-//! is not part of the loop, so the feedback biases nothing. To hold the bead the PZT undoes the partner's motion, so the gain in
-//! um of PZT does not depend on the plant's gain.
+//! The loop holds a bead with the PZT, and the partner makes a square wave unknown to the loop. The motion that the PZT does not
+//! explain comes from the partner: its command through a lag and a delay, times the gain, into the same plant. This command is
+//! not part of the loop, so feedback causes no bias. To hold the bead the PZT cancels the partner's motion, so the gain in um of
+//! PZT does not depend on the plant's gain.
 
 use crate::experiment::on_rig::OnRig;
 use crate::experiment::rows::fix_noise_um;
@@ -16,7 +16,7 @@ use cellpos_session::{EndKind, Failure, Rig};
 use serde::Serialize;
 use std::sync::mpsc::{Sender, channel};
 
-/// Of a normal distribution 95 % is within as many standard deviations.
+/// Standard deviations that contain 95 % of a normal distribution.
 const Z95: f64 = 1.96;
 
 /// How the partner is moved.
@@ -30,7 +30,7 @@ pub struct Moves {
     pub duration_s: f64,
 }
 
-/// The moves, and how fast the device follows them.
+/// The moves, and the speed at which the device follows.
 #[derive(Debug, Clone, Copy)]
 struct Followed {
     half_period_s: f64,
@@ -41,7 +41,7 @@ struct Followed {
 /// The result; intervals are half widths, 95 %.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Measured {
-    /// um of PZT displacement that have the effect of 1 um of the partner.
+    /// PZT displacement, um, with the effect of 1 um of the partner.
     pub gain: f64,
     /// Its interval.
     pub gain_ci95: f64,
@@ -57,7 +57,7 @@ pub struct Measured {
     pub rows: usize,
 }
 
-/// Hands every tick to whoever waits for the run.
+/// Passes every tick to the thread that waits for the run.
 struct Ticks(Sender<TickRecord>);
 
 impl RunSink for Ticks {
@@ -76,7 +76,7 @@ impl RunSink for Ticks {
 pub fn measure(on: &OnRig, moves: Moves) -> Result<Measured, Failure> {
     let mut file = on.file.clone();
     let table = file.partner.as_mut().ok_or_else(no_partner)?;
-    // Mid-ranging is off while it is measured: any gain serves.
+    // Mid-ranging is off during the measurement, so any gain will do.
     table.gain = table.gain.or(Some(1.0));
     let period_s = file.timing.period_us * 1e-6;
     let partner_period_s = table.period_ms * 1e-3;
@@ -164,7 +164,7 @@ fn data(ticks: &[TickRecord], moves: Followed) -> Option<Data> {
     })
 }
 
-/// The commands as the device took them: on the steps of its converter, as it says itself at the end of each.
+/// The commands as the device executed them, on the steps of its converter, from its own report at the end of each.
 fn settled(held: &[&TickRecord]) -> Vec<f64> {
     let mut out: Vec<f64> = held.iter().map(|tick| tick.partner_command_um).collect();
     let mut end = held.len();
@@ -176,7 +176,7 @@ fn settled(held: &[&TickRecord]) -> Vec<f64> {
             .last()
             .unwrap_or(end - 1);
         let applied_um = held[end - 1].partner_applied_um;
-        // A report that has not come yet is of the command before.
+        // Until the new report arrives, it is still that of the command before.
         let of_this = end - start > 100 && applied_um.is_finite();
         if of_this {
             out[start..end].fill(applied_um);
@@ -196,7 +196,7 @@ fn fit(
 ) -> Result<Measured, Failure> {
     let data = data(ticks, moves).ok_or_else(too_little)?;
     let noise_um = fix_noise_um(ticks).unwrap_or(0.0);
-    // Increments over a quarter of the partner's period: a step appears in several of them, and most of the noise of a fix
+    // Use increments over a quarter of the partner's period: several increments contain each step, and most of the noise of a fix
     // averages out.
     let apart = ((0.25 * partner_period_s / period_s).round() as usize).max(1);
     let walk_um2 = 2.0 * model.noise.diffusion_um2_per_s * apart as f64 * period_s;
@@ -284,7 +284,7 @@ fn too_little() -> Failure {
 
 /// Positions that a drive gives at the exposures of its rows.
 fn through(model: &Model, input: &[f64], period_s: f64, age_s: f64) -> Result<Vec<f64>, Failure> {
-    // The plant alone: what else the model has is of the camera, or too fast to matter for a slow partner.
+    // The plant alone: the model's other effects belong to the camera, or are too fast to matter for a slow partner.
     let bare = Model {
         effects: Vec::new(),
         camera_delay_s: None,
@@ -311,7 +311,7 @@ fn earlier(path: &[f64], rows: f64) -> Vec<f64> {
     (0..path.len()).map(|k| at(k as f64 - rows)).collect()
 }
 
-/// Commands as a device of a slew limit follows them, in the middle of each row; `most_um` in a row.
+/// Commands as a device with a slew limit follows them, in the middle of each row; at most `most_um` per row.
 fn slewed(commands_um: &[f64], most_um: f64) -> Vec<f64> {
     let mut at_um = commands_um.first().copied().unwrap_or(0.0);
     let mut path = Vec::with_capacity(commands_um.len());

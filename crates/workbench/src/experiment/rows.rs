@@ -4,7 +4,7 @@ use crate::experiment::exciting::SETTLE_TICKS;
 use cellpos_ident::experiment::{RecordedSegment, Span};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
 
-/// Localisation noise as vision stated it in some ticks, um RMS.
+/// Localisation noise that vision reported in these ticks, um RMS.
 pub(crate) fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
     let (sum, count) = ticks
         .iter()
@@ -16,13 +16,13 @@ pub(crate) fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
     (count > 0).then(|| (sum / count as f64).max(0.0).sqrt())
 }
 
-/// Whether a frame came at this tick and showed no bead to be trusted.
+/// Whether a frame came at this tick but showed no reliable bead.
 pub fn is_unseen(tick: &TickRecord) -> bool {
     let came = tick.verdict != 255 && !tick.flags.has(TickFlags::TIMER);
     came && !tick.measured_um.is_finite()
 }
 
-/// Frames that came with a tick's frame and were not used: they were late, for example after a stall of the camera, but not dropped.
+/// Frames that arrived together with a tick's frame and were not used: late, for example after a stall of the camera, but not dropped.
 pub fn frames_passed_over(tick: &TickRecord) -> usize {
     match is_new_frame(tick) {
         true => usize::from(tick.drained).saturating_sub(1),
@@ -50,9 +50,9 @@ pub(crate) struct Rows {
     skipped: Vec<bool>,
     /// The command of this row's tick came late, or never.
     late: Vec<bool>,
-    /// The frame came, too late or without a bead to be trusted.
+    /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
-    /// Age of each row's frame, ns, where it came in time.
+    /// Age of each row's frame, ns, if it came in time.
     ages_ns: Vec<Option<i64>>,
     /// Usual age of a frame at its tick, in rows.
     usual_age_periods: f64,
@@ -60,8 +60,8 @@ pub(crate) struct Rows {
     of_tick: Vec<usize>,
 }
 
-/// How much later than usual the command of each tick was handed over, counted from the exposure of its frame, ns: usual is the median
-/// of a second, in which no clock drifts by anything that counts. A tick without a frame comes when the frame is overdue.
+/// How much later than usual the command of each tick was handed over, counted from the exposure of its frame, ns. Usual is the median of
+/// a second, in which clocks drift by a negligible amount. A tick without a frame comes when the frame is overdue.
 fn lateness_ns(ticks: &[TickRecord]) -> Vec<i64> {
     const SECOND: usize = 1000;
     let handed_over_ns = |tick: &TickRecord| age_ns(tick) + i64::from(tick.compute_ns);
@@ -76,8 +76,8 @@ fn lateness_ns(ticks: &[TickRecord]) -> Vec<i64> {
     late_ns
 }
 
-/// Lateness from which a command counts as late, ns: a tenth of a period, which at 0.3 of the sampling rate turns the first image of
-/// the held command, the fastest part of a record, by 25 degrees; more on a machine where that would leave too little.
+/// Lateness from which a command counts as late, ns: a tenth of a period, or more on a machine where too few commands would remain. At
+/// 0.3 of the sampling rate a tenth of a period turns the first image of the held command, the fastest part of a record, by 25 degrees.
 fn tolerated_ns(late_ns: &[i64], period_ns: i64) -> i64 {
     let mut sorted: Vec<i64> = late_ns.iter().map(|ns| ns.saturating_abs()).collect();
     sorted.sort_unstable();
@@ -85,7 +85,8 @@ fn tolerated_ns(late_ns: &[i64], period_ns: i64) -> i64 {
     ninth_tenth.clamp(period_ns / 10, period_ns / 2)
 }
 
-/// From a command to its effect, in periods: less than this at 1 kHz over USB or a serial line, and the lateness of a tick beside it.
+/// Upper limit of the delay from a command to its effect, in periods: at 1 kHz over USB or a serial line, with the lateness of a tick
+/// included.
 const LINE_PERIODS: f64 = 1.0;
 
 fn is_new_frame(tick: &TickRecord) -> bool {
@@ -106,14 +107,14 @@ fn age_ns(tick: &TickRecord) -> i64 {
     tick.time_ns - tick.mid_exposure_ns
 }
 
-/// The median, which no stall moves; `None` of nothing.
+/// The median, which a stall does not shift; `None` of an empty list.
 fn median(values: impl Iterator<Item = i64>) -> Option<i64> {
     let mut values: Vec<i64> = values.collect();
     values.sort_unstable();
     values.get(values.len() / 2).copied()
 }
 
-/// Mean of the ages that are known, s.
+/// Mean of the known ages, s.
 fn mean_s(ages_ns: &[Option<i64>]) -> Option<f64> {
     let known = ages_ns.iter().flatten();
     let (sum_ns, count) = known.fold((0, 0), |(sum, count), ns| (sum + ns, count + 1));
@@ -148,7 +149,7 @@ impl Rows {
         let tolerated_ns = tolerated_ns(&late_ns, period_ns);
         rows.usual_age_periods = usual_ns.max(0) as f64 / period_ns as f64;
         let mut first_id = None;
-        // The excitation is played by the clock: a tick's place in it is its number on the clock's grid.
+        // The clock plays the excitation, so a tick's place in it is its number on the clock's grid.
         let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
         let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
         for (tick, late_ns) in ticks[closed..].iter().zip(late_ns) {
@@ -161,7 +162,7 @@ impl Rows {
             } else {
                 next
             };
-            // A row that a timer tick has already taken is overwritten by the frame that came late after all.
+            // A late frame overwrites the row that a timer tick has already taken.
             let row = row.clamp(next.saturating_sub(1), next + 10_000);
             while rows.input.len() <= row {
                 let held_um = rows.input.last().copied().unwrap_or(tick.command_um);
@@ -174,7 +175,7 @@ impl Rows {
                 rows.ages_ns.push(None);
             }
             let age_ns = age_ns(tick);
-            // A frame that is half a period off the usual belongs to another row.
+            // A frame half a period off the usual age belongs to another row.
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
             let late = late_ns.abs() > tolerated_ns;
@@ -186,7 +187,7 @@ impl Rows {
             rows.unseen[row] = is_unseen(tick);
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
             rows.usable[row] = tick.is_controlled();
-            // A tick that was skipped, or whose record was lost, leaves its place to the one behind it.
+            // If a tick was skipped or its record was lost, the next tick takes its place.
             let at = usize::try_from(grid.index(tick.time_ns) - first_index).unwrap_or(0);
             rows.of_tick.resize(at.max(rows.of_tick.len()), row);
             rows.of_tick.push(row);
@@ -194,12 +195,12 @@ impl Rows {
         rows
     }
 
-    /// Mean time from the middle of an exposure to its tick, s; `None` where no frame came in time.
+    /// Mean time from the middle of an exposure to its tick, s; `None` if no frame came in time.
     pub(crate) fn age_s(&self) -> Option<f64> {
         mean_s(&self.ages_ns)
     }
 
-    /// A segment, or what keeps it from being one.
+    /// A segment, or the reason why the stretch is not one.
     pub(crate) fn segment(
         &self,
         span: &Span,
@@ -248,8 +249,8 @@ impl Rows {
         })
     }
 
-    /// The rows whose positions first show the command of `row`. Without them no increment of the record holds the moment at which it
-    /// acted; what it did stands in the later rows.
+    /// The rows whose positions first show the command of `row`. Without these rows no increment of the record contains the moment at
+    /// which the command acted; later rows show only its result.
     fn acts_at(&self, row: usize) -> std::ops::RangeInclusive<usize> {
         let age = self.usual_age_periods;
         row + age.floor() as usize + 1..=row + (age + LINE_PERIODS).floor() as usize + 1
@@ -276,7 +277,7 @@ pub(crate) enum Spoilt {
 }
 
 impl Spoilt {
-    /// In words, for a segment of rows `period_s` apart.
+    /// The reason in words, for rows `period_s` apart.
     pub(crate) fn words(self, period_s: f64) -> String {
         let s = |rows: usize| rows as f64 * period_s;
         match self {

@@ -11,10 +11,10 @@ const PERIOD_NS: i64 = 1_000_000;
 const GAIN_PER_S: f64 = 428.0;
 /// From a command to its effect, ns.
 const LINE_NS: i64 = 300_000;
-/// From the middle of an exposure to the tick that is on time, ns.
+/// From the middle of an exposure to its tick if that is on time, ns.
 const AGE_NS: i64 = 2_100_000;
 
-/// How a machine and a camera misbehave.
+/// Faults of a machine and a camera.
 struct Lateness {
     /// Largest delay of a tick, ns.
     most_ns: f64,
@@ -32,7 +32,7 @@ fn spread(k: i64, step: f64) -> f64 {
 /// Ticks of an integrator that is driven by a sine of the loop's clock.
 fn ticks(frequency_hz: f64, count: i64, late: &Lateness) -> Vec<TickRecord> {
     let mut ticks: Vec<TickRecord> = Vec::new();
-    // Position, and what drives it, up to `done_ns`.
+    // Position and drive, up to `done_ns`.
     let (mut position_um, mut done_ns) = (0.0, i64::MIN / 2);
     let mut at = 0;
     for k in 0..count {
@@ -48,7 +48,7 @@ fn ticks(frequency_hz: f64, count: i64, late: &Lateness) -> Vec<TickRecord> {
         let frame =
             ((due_ns - AGE_NS) as f64 * (1.0 + late.drift) / PERIOD_NS as f64).round() as i64;
         let exposure_ns = (frame as f64 * PERIOD_NS as f64 / (1.0 + late.drift)) as i64;
-        // What has acted by the middle of its exposure.
+        // The commands that have acted by the middle of its exposure.
         let until_ns = exposure_ns - LINE_NS;
         while at < ticks.len() {
             let since_ns = ticks[at].time_ns.max(done_ns);
@@ -166,7 +166,7 @@ fn frames_that_a_stall_kept_back_are_late_and_not_dropped() {
     };
     let mut ticks = ticks(10.0, 200, &calm);
     let (stalled, dropped) = (50..60, 120);
-    // A timer stands in while the camera stalls. Then all frames come at once.
+    // A timer replaces the camera while it stalls. Then all frames come at once.
     for tick in &mut ticks[stalled.clone()] {
         tick.flags.set(TickFlags::TIMER);
         tick.verdict = 255;

@@ -1,4 +1,5 @@
-//! Whether a board keeps docs/board.md: identity, line, refusals. Motion is in `moves`, silence in `silence`.
+//! Tests whether a board conforms to docs/board.md: identity, line, refusals. Motion is in `moves`, silence in
+//! `silence`.
 
 use super::moves::Range;
 use super::sheet::Sheet;
@@ -43,7 +44,7 @@ pub const LINES: [&str; 29] = [
     "reset in mid-flight",
 ];
 
-/// Tries everything; after a broken line the rest counts as not tried. The board is left parked and disarmed.
+/// Runs every test; after a broken line the rest counts as not tried. Leaves the board parked and disarmed.
 pub fn board(sheet: &mut Sheet, talk: Talk, trial: &mut Trial) {
     let mut talk = Some(talk);
     if let Err(failure) = tried(sheet, &mut talk, trial) {
@@ -56,7 +57,7 @@ pub fn board(sheet: &mut Sheet, talk: Talk, trial: &mut Trial) {
             words,
         );
         if let Some(talk) = &mut talk {
-            // Whatever broke it: the PZT is not left where it stands.
+            // Park the PZT, whatever broke the line.
             let _ = talk.send(&ToBoard::Disarm);
         }
     }
@@ -72,7 +73,7 @@ fn tried(sheet: &mut Sheet, talk: &mut Option<Talk>, trial: &mut Trial) -> Resul
     line(sheet, t)?;
     damage(sheet, t)?;
     unasked(sheet, t)?;
-    // Whatever a session before left: nobody's output may be on its way.
+    // A session before may have left the output moving.
     t.request(&ToBoard::Disarm, Request::Disarm)?.ok();
     let Some(range) = Range::of(&identity, trial) else {
         sheet.complete(
@@ -213,12 +214,12 @@ fn line(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Frames that are no frames: each is dropped whole and counted, and what follows it is read.
+/// Invalid frames: the board must drop and count each as a whole, and read the frame after it.
 fn damage(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
     let before = t.must_status()?.bad_frames;
     let ping = Talk::wire(&ToBoard::Ping { token: 0xdead })?;
     let mut flipped = ping.clone();
-    // The last byte of the check sum, in front of the delimiter; never made a zero, which would end the frame.
+    // The last byte of the checksum, before the delimiter. It must not become zero, which would end the frame.
     if let Some(place) = flipped.len().checked_sub(2)
         && let Some(byte) = flipped.get_mut(place)
     {
@@ -281,7 +282,7 @@ fn unasked(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Sessions that may not be had.
+/// Sessions that the board must refuse.
 fn refusals(sheet: &mut Sheet, t: &mut Talk, own: &Identity, range: &Range) -> Result<(), Failure> {
     let session = t.session;
     let mut refused = |name: &'static str, arms: &[Arm], why: &str| -> Result<(), Failure> {
@@ -352,13 +353,13 @@ fn refusals(sheet: &mut Sheet, t: &mut Talk, own: &Identity, range: &Range) -> R
     )
 }
 
-/// The board's clock against the machine's, from two pings with as much between them as the trial took.
+/// The board's clock against the machine's, from two pings: one at the beginning and one at the end of the trial.
 fn clock_rate(
     sheet: &mut Sheet,
     t: &mut Talk,
     first: Option<(i64, f64, u64)>,
 ) -> Result<(), Failure> {
-    // A short round trip says most exactly when the board answered.
+    // The shortest round trip gives the time of the board's answer most precisely.
     let mut last: Option<(i64, f64, u64)> = None;
     for _ in 0..50 {
         if let Some((trip, us)) = t.ping(50.0)?

@@ -19,7 +19,7 @@ const CAMERA: [&str; 5] = [
 ];
 const VISION: [&str; 3] = ["recall", "noise", "time of a look"];
 
-/// Watches the camera of a rig for a time.
+/// Records the camera of a rig for a time.
 pub fn camera(sheet: &mut Sheet, bench: &Bench, duration_s: f64) {
     if let Err(failure) = watched(sheet, bench, duration_s) {
         sheet.judge(
@@ -95,7 +95,7 @@ fn watched(sheet: &mut Sheet, bench: &Bench, duration_s: f64) -> Result<(), Fail
         format!("{promised_hz:.1} Hz to a hundredth: [timing] period_us"),
         "exposures by the camera's own numbers and stamps",
     );
-    // One in ten thousand costs a held bead nothing that shows; the loop coasts over it.
+    // One lost frame in ten thousand has no visible effect on a held bead; the loop coasts over it.
     let share = lost as f64 / (exposed + 1.0);
     sheet.judge(
         ("camera", "frames lost"),
@@ -137,7 +137,7 @@ fn watched(sheet: &mut Sheet, bench: &Bench, duration_s: f64) -> Result<(), Fail
     Ok(())
 }
 
-/// Looks at a bead or cell at rest as the loop does.
+/// Tracks a bead or cell at rest as the loop does.
 pub fn vision(sheet: &mut Sheet, bench: &Bench, duration_s: f64) {
     let sight =
         Capture::of(bench, duration_s).and_then(|capture| Sight::of(bench, &capture.frames));
@@ -176,7 +176,8 @@ fn judge_sight(sheet: &mut Sheet, bench: &Bench, sight: &Sight) {
         Some(px) => format!("the steps between frames show {:.3} {unit}", px * per_px),
         None => "the steps between frames show none: the bead's own motion hides it".to_string(),
     };
-    // The steps give a lower bound, known to some tens of per cent: half as much again is a fit that claims too much.
+    // The steps give a lower bound, uncertain by some tens of percent. If they exceed the stated noise by half, the fit
+    // claims too much.
     let honest = sight
         .measured_px
         .is_none_or(|px| px < 1.5 * sight.stated_px);

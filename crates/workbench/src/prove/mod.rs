@@ -1,8 +1,8 @@
-//! A sheet for the lab book: what was proved of a rig, line by line, each with a number.
+//! A test sheet of a rig for the lab book; each line has a number.
 //!
-//! [`board`] and [`socket`] are conformance tests of the two protocols (docs/board.md, docs/camera-socket.md): they test them byte by
-//! byte, so that a foreign board or camera server passes or fails each line separately. [`camera`]
-//! and [`vision`] go through the drivers of the loop and hold for any camera.
+//! [`board`] and [`socket`] are conformance tests of the two protocols (docs/board.md, docs/camera-socket.md). They test byte by byte, so
+//! that a foreign board or camera server passes or fails each line separately. [`camera`] and [`vision`] go through the drivers of the
+//! loop and hold for any camera.
 
 pub mod board;
 mod camera;

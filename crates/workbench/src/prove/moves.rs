@@ -1,4 +1,4 @@
-//! An armed, moving board: commands that it obeys, range and slew of its output.
+//! Tests of an armed, moving board: commands that it obeys, range and slew of its output.
 
 use super::sheet::Sheet;
 use super::talk::{ANSWER_MS, Talk};
@@ -16,26 +16,27 @@ pub(super) struct Range {
     /// Park of a board that knows of no session.
     pub(super) own_park_pm: i32,
     pub(super) slew_nm_per_s: u32,
-    /// Rate at which the output goes to park.
+    /// Rate at which the output moves to park.
     pub(super) ramp_nm_per_s: u32,
     /// One step of the converter.
     pub(super) step_pm: i32,
 }
 
-/// Watchdog of the trial's sessions: a host that is stopped for a moment is no silence; where silence is tried it is shorter.
+/// Watchdog of the trial's sessions, long enough that a short stop of the host is not silence. The test of silence uses a shorter
+/// one.
 const WATCHDOG_MS: u16 = 500;
 /// An abandoned session parks automatically.
 const HOLD_WATCHDOG_MS: u16 = 3000;
 
 impl Range {
-    /// Within the board's range and the rig file's, about park or as near to it as there is room; `None` where there is no room.
+    /// Limits within the ranges of board and rig file, as near to park as there is room; `None` if there is no room.
     pub(super) fn of(identity: &Identity, trial: &Trial) -> Option<Self> {
         let pm = cellpos_link::picometres;
         let own = identity.limits;
         let [low_um, high_um, slew_um_per_s] = trial.limits_um;
         let (low, high) = (own.low_pm.max(pm(low_um)?), own.high_pm.min(pm(high_um)?));
         let amplitude = pm(trial.amplitude_um)?;
-        // A part of the amplitude to each side stays free for what must be refused.
+        // A part of the amplitude on each side remains free for commands that must be refused.
         let room = amplitude.checked_mul(3)? / 2;
         if low.checked_add(room)? >= high.checked_sub(room)? {
             return None;
@@ -43,8 +44,7 @@ impl Range {
         let park_pm = pm(trial.park_um)?.clamp(own.low_pm, own.high_pm);
         let base_pm = park_pm.clamp(low + room, high - room);
         let slew = own.slew_nm_per_s.min((slew_um_per_s * 1e3) as u32);
-        // From one end to the other in a tenth of a second: there are a hundred statuses on the way, and the board's own clock
-        // divides them.
+        // From one end to the other in a tenth of a second: that gives a hundred statuses, timed by the board's own clock.
         let slow = (f64::from(amplitude) * 2e-3 / 0.1) as u32;
         let codes = (1_i64 << identity.dac_bits) - 1;
         let step = (i64::from(own.high_pm) - i64::from(own.low_pm)) / codes.max(1);
@@ -75,7 +75,7 @@ impl Range {
         }
     }
 
-    /// Time that a way takes at the session's slew or, for `park`, at the ramp, ms; with room for a late machine.
+    /// Time for a distance at the session's slew or, for `park`, at the ramp, ms; with a margin for a late machine.
     pub(super) fn way_ms(&self, from_pm: i32, to_pm: i32) -> f64 {
         let rate = f64::from(self.slew_nm_per_s.min(self.ramp_nm_per_s)) * 1e3;
         1e3 * f64::from((to_pm - from_pm).abs()) / rate.max(1.0) + 500.0
@@ -92,12 +92,12 @@ impl Range {
         Ok(status)
     }
 
-    /// Whether the output stands there, to a step and a half of the converter.
+    /// Whether the output is there, within a step and a half of the converter.
     pub(super) fn is_at(&self, status: &Status, at_pm: i32) -> bool {
         2 * (status.applied_pm - at_pm).abs() <= 3 * self.step_pm
     }
 
-    /// Arms a new session, with a first command if `first` says where to.
+    /// Arms a new session, and sends a first command if `first` gives a displacement.
     pub(super) fn session(
         &self,
         t: &mut Talk,
@@ -116,7 +116,7 @@ impl Range {
     }
 }
 
-/// The lines of a moving board; false when it could not be armed.
+/// The lines of a moving board; false if it could not be armed.
 pub(super) fn moves(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<bool, Failure> {
     if !arms(sheet, t, range)? {
         return Ok(false);
@@ -172,7 +172,7 @@ fn arms(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<bool, Failure>
     Ok(true)
 }
 
-/// Sends commands, one a millisecond, for as many as there are, and gives the statuses that came.
+/// Sends all commands, one per millisecond, and returns the statuses that arrived.
 fn drive(
     t: &mut Talk,
     count: u32,
@@ -258,7 +258,7 @@ fn bounds(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<(), Failure>
     t.command(range.high_pm + amplitude_pm / 4, range.base_pm)?;
     let top = range.settle(t, range.high_pm)?;
     let mut highest_pm = top.applied_pm;
-    // Held there for a while: nothing may creep beyond.
+    // Hold for a while: the output may not creep beyond.
     let held = drive(t, 50, |_| (range.high_pm + amplitude_pm / 4, range.base_pm))?;
     highest_pm = held
         .iter()

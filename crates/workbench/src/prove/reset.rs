@@ -1,4 +1,4 @@
-//! A microcontroller that is reset while its output stands off park.
+//! Test of a microcontroller that is reset while its output is away from park.
 
 use super::moves::Range;
 use super::sheet::Sheet;
@@ -26,7 +26,7 @@ pub(super) fn reset(
     let Some(mut t) = talk.take() else {
         return Ok(());
     };
-    // Whichever end of the range is farther from where it will go.
+    // The end of the range that is farther from park.
     let far = |pm: &i32| (pm - range.own_park_pm).abs();
     let at_pm = [range.low_pm, range.high_pm].into_iter().max_by_key(far);
     let at_pm = at_pm.unwrap_or(range.high_pm);
@@ -35,7 +35,7 @@ pub(super) fn reset(
     let mut t = again(t)?;
     let hello = t.hello()?;
     let first = t.must_status()?;
-    // The way to park begins before anything else, and nobody is armed on it.
+    // The motion to park begins before anything else, and the board must not be armed during it.
     let refused = match range.is_at(&first, range.own_park_pm) {
         true => None,
         false => Some(range.session(&mut t, |_| {}, None)?),

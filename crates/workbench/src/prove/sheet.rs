@@ -8,13 +8,13 @@ use serde::Serialize;
 pub enum Verdict {
     /// As it must be.
     Passed,
-    /// Not as it must be.
+    /// It differs from the requirement.
     Failed,
-    /// Not looked at: [`Line::note`] says why.
+    /// Not tested: [`Line::note`] says why.
     NotTried,
 }
 
-/// One thing that was looked at.
+/// One tested property.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Line {
     /// Part of the rig: `board`, `socket`, `camera`, `vision`, `machine`.
@@ -58,7 +58,7 @@ impl Sheet {
             } else {
                 Verdict::Failed
             },
-            // A value that could not be measured is not a number.
+            // A value that could not be measured is NaN.
             value: value.into().filter(|value| value.is_finite()),
             unit,
             limit: limit.into(),
@@ -79,7 +79,7 @@ impl Sheet {
         });
     }
 
-    /// The lines of a part that have not been reached, as not tried.
+    /// Adds the lines of a part that were not reached, as not tried.
     pub fn complete(&mut self, part: &'static str, names: &[&'static str], why: &str) {
         for name in names {
             if self.line(part, name).is_none() {

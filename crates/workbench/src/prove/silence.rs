@@ -1,4 +1,4 @@
-//! Behaviour of a board in silence, and requested stops.
+//! Tests of a board in silence, and of requested stops.
 
 use super::moves::Range;
 use super::sheet::Sheet;
@@ -7,7 +7,7 @@ use super::trial::{of, um};
 use cellpos_link::{BoardState, Fault, Request, ToBoard, ToHost};
 use cellpos_session::Failure;
 
-/// Watchdogs of the trial, ms: long enough that a machine under load keeps the first one fed, short enough to wait for.
+/// Watchdogs of the trial, ms: long enough that a machine under load can feed the first one, short enough to wait for.
 const WATCHDOG_MS: u16 = 100;
 const HOLD_MS: u16 = 300;
 /// What the board's own step and its message may add to a watchdog, ms.
@@ -16,7 +16,7 @@ const LATE_MS: f64 = 2.0;
 /// The lines of silence and of stops; the board is left disarmed and at park.
 pub(super) fn silence(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<(), Failure> {
     let amplitude_pm = range.high_pm - range.base_pm;
-    // Off the zero flow, so that the way to it shows.
+    // Away from zero flow, so that the motion to it is visible.
     let (at_pm, neutral_pm) = (
         range.base_pm + amplitude_pm / 2,
         range.base_pm - amplitude_pm / 4,
@@ -27,7 +27,8 @@ pub(super) fn silence(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<
     stops(sheet, t, range, (at_pm, neutral_pm))
 }
 
-/// Arms with the short watchdogs and moves to a place, keeping the watchdog fed; why it is not armed, if it is not.
+/// Arms with the short watchdogs and moves to a place while it feeds the watchdog; returns the reason if it is not
+/// armed.
 fn go(
     t: &mut Talk,
     range: &Range,
@@ -52,7 +53,7 @@ fn go(
     Ok(armed)
 }
 
-/// Board time at which the newest command was obeyed, and of the first status in a state behind it, us.
+/// Board time at which the newest command was obeyed, and time of the first status in a later state, us.
 fn turned(t: &Talk, seq: u32, state: BoardState) -> Option<(u64, u64)> {
     let obeyed = t
         .statuses()
@@ -71,7 +72,7 @@ fn holds(
     range: &Range,
     (at_pm, neutral_pm): (i32, i32),
 ) -> Result<(), Failure> {
-    // A long hold: it is not to park meanwhile.
+    // A long hold, during which it must not park.
     let armed = go(t, range, 5000, (at_pm, neutral_pm))?;
     t.pump()?;
     t.heard.clear();

@@ -1,4 +1,5 @@
-//! Whether a camera server keeps docs/camera-socket.md: headers byte by byte, numbers, times, losses, back-pressure, reconnection.
+//! Tests whether a camera server conforms to docs/camera-socket.md: headers byte by byte, numbers, times, losses, back-pressure,
+//! reconnection.
 
 use super::sheet::Sheet;
 use crate::line_test::Quantiles;
@@ -100,7 +101,7 @@ impl Client {
     }
 }
 
-/// Tries everything with the server of a socket that promises a rate, for a time.
+/// Runs every test for a time, with the server of a socket that promises a rate.
 pub fn socket(sheet: &mut Sheet, path: &Path, rate_hz: f64, duration_s: f64) {
     match Client::connect(path) {
         Ok(client) => tried(sheet, client, path, rate_hz, duration_s),
@@ -191,7 +192,7 @@ fn numbers(sheet: &mut Sheet, frames: &[Came]) {
     );
 }
 
-/// Stamps against each other and against the time of arrival.
+/// Compares stamps with each other and with the time of arrival.
 fn times(sheet: &mut Sheet, frames: &[Came], rate_hz: f64) {
     let period_ns = 1e9 / rate_hz;
     let mid_ns = |came: &Came| came.header.mid_exposure_ns as f64;
@@ -231,7 +232,7 @@ fn times(sheet: &mut Sheet, frames: &[Came], rate_hz: f64) {
         exposed / ((mid_ns(b) - mid_ns(a)) * 1e-9)
     });
     let rate = span.unwrap_or(f64::NAN);
-    // The loop allows a clock to be off by 200 ppm; a rate is a promise that the loop's period is made of: a hundredth.
+    // The loop accepts a clock error of 200 ppm. The rate sets the loop's period, so it must be right to a hundredth.
     sheet.judge(
         of("rate of the stamps"),
         (rate / rate_hz - 1.0).abs() < 0.01,
@@ -266,7 +267,7 @@ fn pauses(sheet: &mut Sheet, client: &mut Client, rate_hz: f64) {
             }
         }
     }
-    // Everything that was exposed in the pause and is not there was dropped: the numbers say so, or nothing was lost.
+    // Frames exposed in the pause that never come were dropped: the numbers must show it.
     let exposed = rate_hz * PAUSE.as_secs_f64();
     let accounted = jump > 1 || waited as f64 > 0.8 * exposed;
     sheet.judge(
@@ -295,7 +296,7 @@ fn connects_again(sheet: &mut Sheet, mut old: Client, path: &Path) {
         Ok((client, first))
     });
     let ms = (monotonic_ns() - start_ns) as f64 * 1e-6;
-    // The old one is served on, frame by frame, or closed; it is never out of step.
+    // The server continues to serve the old connection, frame by frame, or closes it. It never gets out of step.
     let end_ns = monotonic_ns() + 500_000_000;
     let mut old_ended = String::new();
     while old_ended.is_empty() && monotonic_ns() < end_ns {

@@ -1,4 +1,4 @@
-//! The board's protocol, message by message, with what came back and when.
+//! The board's protocol, message by message, with each answer and its time.
 
 use cellpos_drivers::Port;
 use cellpos_link::{
@@ -7,26 +7,26 @@ use cellpos_link::{
 use cellpos_rig::Clock;
 use cellpos_session::Failure;
 
-/// How long an answer is waited for where the protocol names no time, ms.
+/// Longest wait for an answer if the protocol names no time, ms.
 pub(super) const ANSWER_MS: f64 = 500.0;
 
-/// A conversation with a board that is not trusted.
+/// A conversation with an untrusted board.
 pub struct Talk {
     port: Box<dyn Port>,
     decoder: Decoder<ToHost>,
     clock: Clock,
-    /// What came since it was last cleared: when it was read, ns, and what.
+    /// Messages since the last clear, each with the time of its reading, ns.
     pub(super) heard: Vec<(i64, ToHost)>,
     pub(super) session: u16,
     pub(super) seq: u32,
     start_ns: i64,
     token: u32,
-    /// Where the last command wanted to be, and its zero flow, pm.
+    /// Displacement and zero flow of the last command, pm.
     last: Option<(i32, i32)>,
 }
 
 impl Talk {
-    /// With what answers on a port.
+    /// Opens a conversation with the device on a port.
     pub fn on(port: Box<dyn Port>) -> Self {
         let clock = Clock::Real;
         let start_ns = clock.now_ns();
@@ -34,7 +34,7 @@ impl Talk {
             port,
             decoder: Decoder::new(),
             heard: Vec::new(),
-            // Session numbers are drawn at random: the clock's last digits are.
+            // Session numbers are random: the last digits of the clock.
             session: (start_ns / 1000 % 60_000) as u16 + 1,
             seq: 0,
             start_ns,
@@ -117,7 +117,7 @@ impl Talk {
         }
     }
 
-    /// Listens until something comes, at most for a time, ms; gives it with the time that it took, ms.
+    /// Waits for the next message, at most for a time, ms; returns it with the time that it took, ms.
     pub(super) fn wait<T>(
         &mut self,
         ms: f64,
@@ -140,7 +140,7 @@ impl Talk {
         }
     }
 
-    /// Sends a message and waits for what answers it; what came before is forgotten.
+    /// Sends a message and waits for its answer; forgets earlier messages.
     pub(super) fn ask<T>(
         &mut self,
         message: &ToBoard,
@@ -153,7 +153,7 @@ impl Talk {
         self.wait(ms, is)
     }
 
-    /// Says hello, again and again, as long as a board that the opening of its port resets may take.
+    /// Repeats the hello for as long as a board may take that is reset when its port is opened.
     pub(super) fn hello(&mut self) -> Result<Option<(cellpos_link::Identity, f64)>, Failure> {
         let hello = ToBoard::Hello {
             protocol: PROTOCOL_VERSION,
@@ -185,7 +185,7 @@ impl Talk {
         Ok(pong.map(|(time_us, ms)| (ms, time_us)))
     }
 
-    /// The status after all that was sent so far: a ping's answer comes behind what was before it.
+    /// The status after all that was sent so far: the answer to a ping comes after all earlier answers.
     pub(super) fn status(&mut self) -> Result<Option<Status>, Failure> {
         if self.ping(ANSWER_MS)?.is_none() {
             return Ok(None);
@@ -197,7 +197,7 @@ impl Talk {
         Ok(status.map(|(status, _)| status))
     }
 
-    /// The status, or a failure in words where none comes.
+    /// The status, or a failure in words if none comes.
     pub(super) fn must_status(&mut self) -> Result<Status, Failure> {
         let name = self.port.name().to_string();
         self.status()?.ok_or_else(|| {

@@ -1,13 +1,13 @@
-//! How a board is tried, and how its lines are named.
+//! Settings of a board's trial, and names of its lines.
 
 use super::talk::Talk;
 use cellpos_session::Failure;
 
-/// How a board is tried.
+/// Settings of a trial.
 pub struct Trial<'a> {
-    /// Range and slew of the rig file, which the trial stays within, um and um/s.
+    /// Range and slew of the rig file, um and um/s; the trial stays within them.
     pub limits_um: [f64; 3],
-    /// Where the PZT is left, um.
+    /// Displacement of the PZT at the end, um.
     pub park_um: f64,
     /// How far the output is moved to each side, um.
     pub amplitude_um: f64,

@@ -1,8 +1,7 @@
-//! Margins of a control law on any model, nonlinear effects included: on the response to small sines.
+//! Margins of a control law on any model, nonlinear effects included, from the response to small sines.
 //!
-//! A hysteresis or a backlash has no transfer function; a holding loop meets its response to motion of that size. That response is
-//! simulated line by line without noise, so the same figures can be given
-//! for the model that a controller was designed on and for the rig that it runs on.
+//! Hysteresis and backlash have no transfer function; a holding loop sees their response to motion of its own size. This module
+//! simulates that response line by line without noise. So the same figures exist for the model of the design and for the rig.
 
 use cellpos_control::LinearLaw;
 use cellpos_ident::tone_fit::{ToneFit, Whitening, fit_block};
@@ -11,12 +10,12 @@ use cellpos_session::Failure;
 use serde::Serialize;
 use std::f64::consts::{PI, TAU};
 
-/// Lines of the response, and the range that margins are looked for in, Hz.
+/// Lines of the response, and the range of the search for margins, Hz.
 const LOW_HZ: f64 = 1.0;
 const HIGH_HZ: f64 = 450.0;
 const LINES: usize = 36;
-/// Amplitudes of the bead, and the most of the PZT's, um. The first is what holding against Brownian motion and drift takes;
-/// where a dead zone leaves nothing of that, the next.
+/// Amplitudes of the bead, and the largest of the PZT, um. The first is that of holding against Brownian motion and drift; the
+/// next is used if a dead zone swallows the first.
 pub const AMPLITUDES_UM: [f64; 3] = [0.3, 1.0, 3.0];
 
 /// Bead over command as a record shows it, delay and hold included.
@@ -64,7 +63,7 @@ impl Response {
         Ok(response)
     }
 
-    /// Between the lines: gain and phase are straight in the logarithm of frequency.
+    /// Interpolates gain and phase linearly in the logarithm of frequency.
     fn dense(&self, points: usize) -> Vec<(f64, Complex<f64>)> {
         let mut phase = Vec::with_capacity(self.value.len());
         let mut last = 0.0;
@@ -89,10 +88,10 @@ impl Response {
     }
 }
 
-/// Margins of a loop. Where it is not stable they describe the open loop's curve only.
+/// Margins of a loop. For an unstable loop they only describe the curve of the open loop.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LoopMargins {
-    /// Whether the closed loop is stable, by the poles of the linear model that stands for the response.
+    /// Whether the closed loop is stable, by the poles of the linear model in place of the response.
     pub stable: bool,
     /// Peak of the sensitivity.
     pub ms: f64,
@@ -108,7 +107,7 @@ pub struct LoopMargins {
     pub delay_margin_ms: f64,
 }
 
-/// Margins of a law on a response; `stable` is taken over. `None` without a gain crossover.
+/// Margins of a law on a response; `stable` is copied. `None` without a gain crossover.
 pub fn margins(
     response: &Response,
     law: &LinearLaw,
@@ -139,7 +138,7 @@ pub fn margins(
     for pair in curve.windows(2) {
         let [(f0, l0), (f1, l1)] = [pair[0], pair[1]];
         let (g0, g1) = (l0.norm().ln(), l1.norm().ln());
-        // Where along the short way from one point to the next something changes its sign.
+        // Fraction of the way from one point to the next at which the function changes its sign.
         let at = |a: f64, b: f64| if a == b { 0.0 } else { a / (a - b) };
         if g0 * g1 <= 0.0 {
             let x = at(g0, g1);

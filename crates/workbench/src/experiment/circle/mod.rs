@@ -1,4 +1,4 @@
-//! The circle: identify, reconcile, design again, track again, and what each step was worth.
+//! The circle: identify, reconcile, design again, track again, and measure the gain from each step.
 //!
 //! The steps get a model and a rig; the hidden model stays in the rig. On the emulated rig the truth is known, so the margins that
 //! each model predicts are compared with those of the loop.
@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 
 /// Settings of the circle.
 pub struct Job<'a> {
-    /// The model that is believed in at the start.
+    /// The assumed model at the start.
     pub given: Model,
     /// The rig, and the loop on it.
     pub rig: OnRig,
@@ -34,11 +34,11 @@ pub struct Job<'a> {
     pub effort: f64,
     /// Most effects to add.
     pub max_effects: usize,
-    /// Most further experiments where the first leaves names open.
+    /// Most further experiments if the first leaves names open.
     pub rounds: usize,
     /// Folder for the records.
     pub folder: &'a Path,
-    /// Finished segments of an identification that was stopped on the way round.
+    /// Finished segments of an identification that was stopped within the circle.
     pub resume: Option<&'a Path>,
 }
 
@@ -62,7 +62,7 @@ pub struct Circle {
     pub sample_s: f64,
 }
 
-/// Goes round once; `progress` hears what is being done.
+/// Runs the circle once; calls `progress` with each step.
 ///
 /// # Errors
 /// The rig failed, an experiment could not be finished, or no verdict could be reached.
@@ -86,7 +86,8 @@ pub fn close(job: Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Ci
             .map_err(Failure::failed)?
     };
     let (mut start, base) = base(&done, &given, &identified);
-    // What the rig file states needs no finding. Without it, the motion within an exposure counts as delay: 14 us at 0.5 ms.
+    // An effect that the rig file states needs no finding. Without the exposure, its motion blur counts as delay: 14 us at 0.5
+    // ms.
     if let Some(exposure_s) = connect::stated_exposure_s(file).filter(|s| *s > 0.0)
         && start.effect("exposure-averaging").is_none()
     {
@@ -94,7 +95,7 @@ pub fn close(job: Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Ci
     }
     let (reconciled, collected) = reconcile(&job, &mut start, &first, survey, progress)?;
 
-    // The truth as the loop meets it: the delay is from the middle of an exposure to the tick that uses its frame.
+    // The truth as the loop sees it: the delay runs from the middle of an exposure to the tick that uses its frame.
     let truth = job.truth.clone().map(|model| Model {
         working_point_um: file.emulator.neutral_um,
         ..stage::with_delay(model, first.age_s)
@@ -149,7 +150,7 @@ fn measure(job: &Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Don
     })
 }
 
-/// The model that reconcile extends: the identified one where it describes the response, else the one given; and why.
+/// The model that reconcile extends, and why: the identified one if it describes the response, else the given one.
 fn base(done: &Done, given: &Model, identified: &Model) -> (Model, (&'static str, String)) {
     /// Penalised misfit, in variances, up to which the fit counts as a description.
     const DESCRIBES: f64 = 2.0;
@@ -166,7 +167,7 @@ fn base(done: &Done, given: &Model, identified: &Model) -> (Model, (&'static str
     (given.clone(), ("given", why))
 }
 
-/// Names what is missing from `start`, from the survey and whatever else has to be recorded.
+/// Names the effects missing from `start`, with the survey and any further records that are needed.
 fn reconcile(
     job: &Job<'_>,
     start: &mut Model,

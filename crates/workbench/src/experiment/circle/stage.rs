@@ -54,7 +54,7 @@ pub struct Stage {
     pub kp_um_per_um: Option<f64>,
     /// Integral gain of a PI, 1/s.
     pub ki_per_s: Option<f64>,
-    /// Amplitude of the motion that margins are given for, um.
+    /// Amplitude of the motion to which the margins apply, um.
     pub margins_at_um: f64,
     /// Margins on the model that it was designed on.
     pub predicted: Option<LoopMargins>,
@@ -65,7 +65,7 @@ pub struct Stage {
     pub hold: Option<Tracked>,
     /// Following the sine.
     pub sine: Option<Tracked>,
-    /// Why no controller could be designed on this model.
+    /// The reason why no controller could be designed on this model.
     pub problem: Option<String>,
     /// Response of the model.
     #[serde(skip)]
@@ -81,8 +81,8 @@ impl Stage {
     }
 }
 
-/// The model with this delay from the middle of an exposure to the tick as its only delay. It includes the delay of the average
-/// over the exposure; the roll-off of that average (4 % at 300 Hz for half a millisecond) is above a loop's band.
+/// The model with this delay from the middle of an exposure to the tick as its only delay. The delay includes that of the average
+/// over the exposure. Its roll-off (4 % at 300 Hz for half a millisecond) is above a loop's band.
 pub fn with_delay(mut model: Model, delay_s: f64) -> Model {
     model
         .effects
@@ -90,11 +90,10 @@ pub fn with_delay(mut model: Model, delay_s: f64) -> Model {
     model.with_effect(effects::time_delay(delay_s))
 }
 
-/// The linear model for the design of a controller. An effect without a transfer function is replaced by the gain that it leaves
-/// to motion: the largest between the amplitude of holding and ten times that, so that a dead zone does not raise the
-/// controller's gain.
+/// The linear model for the design of a controller. A gain replaces each effect without a transfer function. It is the largest
+/// gain between the amplitude of holding and ten times that, so that a dead zone does not raise the controller's gain.
 fn designable(model: &Model, sample_s: f64) -> Result<Model, Failure> {
-    /// Where the two are compared, Hz: about the crossover of a loop with these delays.
+    /// Frequency of the comparison, Hz: about the crossover of a loop with these delays.
     const AT_HZ: f64 = 20.0;
     let mut linear = model.clone();
     linear.effects.retain(|e| match e.act() {
@@ -119,14 +118,14 @@ fn designable(model: &Model, sample_s: f64) -> Result<Model, Failure> {
         factor = factor.max(gain(model, amplitude_um)? / gain(&linear, amplitude_um)?);
     }
     if factor.is_finite() {
-        // The gain that a loop must stand anyway.
+        // The range of gain that a loop must tolerate anyway.
         let factor = factor.clamp(0.5, 2.0);
         linear.plant = linear.plant.scaled(factor).map_err(Failure::input)?;
     }
     Ok(linear)
 }
 
-/// Designs on `model` (which holds its delay), weighs the law on it and on the truth, and runs the rig with it.
+/// Designs a controller on `model` (which contains its delay), computes margins on it and on the truth, and runs the rig.
 pub fn run(
     name: &'static str,
     model: Model,
@@ -159,7 +158,7 @@ pub fn run(
         problem: None,
         response,
     };
-    // A fitted model may be one that no loop can be built on; that is a finding, and no reason to stop.
+    // There may be no controller for a fitted model: that is a finding, not a reason to stop.
     let (prepared, law) = match designed(&model, controller, &timing, sample_s) {
         Ok(designed) => designed,
         Err(Failure::BadInput(why)) => {
@@ -224,7 +223,7 @@ fn designed(
     let plant = DesignPlant::from_model(&prepared.model, Some(delay_s), sample_s)
         .map_err(Failure::input)?;
     let loop_model = plant.loop_model().map_err(Failure::input)?;
-    // The loop itself refuses what only looks buildable.
+    // The loop itself refuses a controller that only seems valid.
     prepared
         .controller
         .loop_config(&prepared.model)

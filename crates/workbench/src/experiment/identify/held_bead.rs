@@ -99,14 +99,14 @@ pub struct HeldBead {
     period_ns: i64,
     start_ns: i64,
     neutral_um: f64,
-    /// Sum and number of the variances that vision stated, um^2.
+    /// Sum and number of the variances that vision reported, um^2.
     variance_um2: (f64, u64),
     /// Sum and number of the ages of frames at their ticks, ns.
     ages: (i64, i64),
 }
 
 impl HeldBead {
-    /// Localisation noise as vision stated it so far, um RMS.
+    /// Localisation noise that vision reported so far, um RMS.
     pub fn fix_noise_um(&self) -> Option<f64> {
         let (sum, count) = self.variance_um2;
         (count > 0).then(|| (sum / count as f64).max(0.0).sqrt())
@@ -178,7 +178,7 @@ impl HeldBead {
         let neutral_um = report.applied_um;
         controller.start(neutral_um, neutral_um);
         let period_ns = setup.world.period_ns();
-        // Ticks fall on the deliveries of frames, as they do when the arrival of a frame starts the tick.
+        // Ticks coincide with the deliveries of frames, as on a rig, where the arrival of a frame starts the tick.
         let since_ns = setup.clock.now_ns();
         let next_ns = (since_ns / period_ns + 1) * period_ns;
         let mut bead = Self {
@@ -212,8 +212,8 @@ impl HeldBead {
         Ok(newest)
     }
 
-    /// Waits for the next frame, at most a quarter of a period longer than it should take: a tick starts with the arrival of a
-    /// frame, and the camera's clock is its own. The newest measurement then.
+    /// Waits for the next frame, at most a quarter of a period beyond its due time, and returns the newest measurement. A tick
+    /// starts when a frame arrives, and the camera has its own clock.
     fn arrival(&mut self) -> Result<Option<Measurement>, Failure> {
         let latest_ns = self.next_ns + self.period_ns / 4;
         let first = match &mut self.source {
@@ -275,7 +275,7 @@ impl HeldBead {
         DelayTest::evaluate(switched_s, seen)
     }
 
-    /// Rests at neutral until a bead has been seen for 100 ms on end, at most for 10 s, then holds it for half a second.
+    /// Rests at neutral until a bead has been seen for 100 ms without a gap, at most for 10 s, then holds it for half a second.
     pub fn wait_for_bead(&mut self) -> Result<(), Failure> {
         let mut seen = 0;
         for _ in 0..10_000 {
@@ -346,7 +346,7 @@ impl Bench for HeldBead {
         let out = self.controller.step(&input);
         self.send(out.command_um, out.neutral_um)?;
         self.next_ns += self.period_ns;
-        // A row is a position of the nominal age: an older one belongs to an earlier row and is left out.
+        // A row holds a position of the nominal age. An older position belongs to an earlier row and is left out.
         let on_time = good.filter(|_| age_samples == 0);
         if on_time.is_some() {
             self.ages.0 += age_ns;

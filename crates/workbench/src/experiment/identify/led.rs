@@ -14,7 +14,7 @@ pub struct LitFrames {
 }
 
 impl LitFrames {
-    /// Takes the next frame; one that is stamped before the last is left out.
+    /// Takes the next frame; skips one that is stamped before the last.
     pub fn push(&mut self, stamp: &FrameStamp, buffer: &FrameBuffer) {
         let mid_s = stamp.mid_exposure_ns as f64 * 1e-9;
         if self.mid_s.last().is_none_or(|last| mid_s > *last) {
@@ -27,7 +27,8 @@ impl LitFrames {
 
 /// A delay test and its observations.
 pub struct DelayTest {
-    /// From the command to the exposure that shows it, by the frames' stamps; [`DelayTest::up_to_the_tick`] adds the way of the frame.
+    /// From the command to the exposure that shows it, by the frames' stamps; [`DelayTest::up_to_the_tick`] adds the age of the frame at
+    /// its tick.
     pub estimate: DelayEstimate,
     /// Edges seen.
     pub seen: Vec<SeenEdge>,
@@ -37,7 +38,7 @@ pub struct DelayTest {
     pub frame_s: Vec<f64>,
     /// Their mean grey levels.
     pub grey: Vec<f64>,
-    /// What a command takes to the board, s: half of a round trip; `None` where nobody asked.
+    /// Time of a command to the board, s: half of a round trip; `None` if not measured.
     pub line_s: Option<f64>,
 }
 
@@ -67,11 +68,11 @@ impl DelayTest {
         })
     }
 
-    /// Remedy for time stamps that are not those of the exposures: the delay of the LED test beyond the line is their error. To
-    /// be asked before [`DelayTest::up_to_the_tick`].
+    /// Remedy for time stamps that are not those of the exposures: the delay of the LED test beyond the line is their error. Call it
+    /// before [`DelayTest::up_to_the_tick`].
     pub fn stamps_off(&self, file: &RigFile) -> Option<String> {
         let off_s = self.estimate.delay_s - self.line_s?;
-        // The line's two ways need not take the same time.
+        // The two directions of the line may differ in time.
         let unsure_s = self.line_s? + 0.5 * (self.estimate.ci95_s[1] - self.estimate.ci95_s[0]);
         if off_s.abs() < (WORTH_SAYING * 1e-6 * file.timing.period_us).max(unsure_s) {
             return None;
@@ -99,7 +100,7 @@ impl DelayTest {
         self.estimate.ci95_s = self.estimate.ci95_s.map(|end| end + age_s);
     }
 
-    /// What is wrong when the test tells less than a tenth of a millisecond.
+    /// The warning if the test determines the delay to less than a tenth of a millisecond.
     pub fn vague(&self) -> Option<String> {
         /// 10.8 degrees at 300 Hz.
         const WORTH_SAYING_S: f64 = 1e-4;

@@ -1,4 +1,4 @@
-//! From arguments to a finished identification: plan, run, delay test, summary.
+//! A whole identification from its arguments: plan, run, delay test, summary.
 
 pub mod held_bead;
 pub mod led;
@@ -41,7 +41,7 @@ pub struct Job {
     pub excitation: Excitation,
     /// Largest amplitudes.
     pub limits: ExcitationLimits,
-    /// Measuring time per line is this over the frequency, s at 1 Hz.
+    /// Measuring time of a line at 1 Hz, s; inversely proportional to frequency.
     pub seconds_at_1_hz: f64,
     /// Edges of the LED test; 0: none.
     pub led_edges: usize,
@@ -49,11 +49,11 @@ pub struct Job {
     pub bootstrap: usize,
     /// Seed of excitation, dither and bootstrap.
     pub seed: u64,
-    /// The rig of a rig.toml; left out: an emulated one in this process, without the loop's threads.
+    /// The rig of a rig.toml. Left out: an emulated rig in this process, without the loop's threads.
     pub rig: Option<OnRig>,
-    /// Segments of a stopped identification to go on from.
+    /// Segments of a stopped identification to continue from.
     pub resume: Option<PathBuf>,
-    /// Where finished segments go when the identification is stopped.
+    /// File for the finished segments if the identification is stopped.
     pub keep_in: Option<PathBuf>,
 }
 
@@ -75,12 +75,12 @@ pub struct Done {
     pub runs: Vec<String>,
 }
 
-/// Runs a job; `progress` hears ticks done and ticks in all.
+/// Runs a job; calls `progress` with ticks done and ticks in all.
 pub fn run(job: &Job, progress: impl FnMut(usize, usize) + Send) -> Result<Done, Failure> {
     run_shown(job, progress, None)
 }
 
-/// The same; on a rig it is shown on the live page that `pages` wants.
+/// The same; on a rig the live page of `pages` shows it.
 pub fn run_shown(
     job: &Job,
     mut progress: impl FnMut(usize, usize) + Send,
@@ -167,7 +167,7 @@ fn held_bead(
     mut records: Vec<RecordedSegment>,
     progress: &mut dyn FnMut(usize),
 ) -> Result<Raw, Failure> {
-    // Segments run in order here: what was measured behind a gap is measured again.
+    // Segments run in order here: those behind a gap are measured again.
     let whole = records.iter().zip(0..).take_while(|(r, i)| r.index == *i);
     records.truncate(whole.count());
     let mut bead = HeldBead::open(job.setup.clone())?;
@@ -191,7 +191,7 @@ fn held_bead(
     })
 }
 
-/// The delay that the edges of an LED tell, if the job asks for it.
+/// The delay from the edges of an LED, if the job requests the test.
 fn led_delay(job: &Job, rig: &OnRig) -> Result<Option<DelayTest>, Failure> {
     Ok(match (job.led_edges, rig.file.is_emulated()) {
         (0, _) => None,
@@ -239,7 +239,7 @@ fn on_rig(
         if todo.is_empty() {
             break;
         }
-        // What is finished is on the disk as it ends, whatever ends the process.
+        // Write each segment to the disk when it ends, so that it survives the process.
         let before = records.clone();
         let mut segment = |so_far: &Acquired| {
             if let Err(failure) = kept(job, plan, &joined(&before, &so_far.records)) {
@@ -274,7 +274,7 @@ fn on_rig(
                 turn.part
             )
         }));
-        // A run that ended early has not tried the later ones.
+        // A run that ended early has not tried the later segments.
         let tried = if run_through { failed.len() } else { 1 };
         for turn in failed.iter().take(tried) {
             spoilt[turn.index] += 1;
@@ -317,14 +317,14 @@ fn on_rig(
     })
 }
 
-/// Whether another run may succeed without a person's action: a stall may be over, and after a held bead another one may come.
+/// Whether another run may succeed without a person's action: a stall may be over, and after a lost bead another may come.
 fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
     let lost = ended.refusal == Some(Refusal::NoBead) || ended.reason == Some(SafeReason::BeadLost);
     ended.may_pass() || had_bead && lost
 }
 
-/// Segments that are not measured yet. A segment that failed once may have met a stall: it runs again as planned. If it fails
-/// again, this rig moves the bead further than the model says: it runs at half the amplitude, then at a quarter.
+/// Segments not measured yet. After a first failure, which may be a stall, a segment runs again as planned. If it fails again,
+/// the rig moves the bead further than the model predicts: it runs at half the amplitude, then at a quarter.
 fn missing(plan: &Plan, records: &[RecordedSegment], spoilt: &[u32]) -> Vec<Turn> {
     let is_missing = |index: &usize| records.iter().all(|r| r.index != *index);
     let indices = (0..plan.segments.len()).filter(is_missing);
@@ -344,7 +344,7 @@ fn joined(before: &[RecordedSegment], now: &[RecordedSegment]) -> Vec<RecordedSe
     all
 }
 
-/// Keeps what is finished; where, if anything is.
+/// Writes the finished segments; returns the file, if there are any.
 fn kept(job: &Job, plan: &Plan, records: &[RecordedSegment]) -> Result<Option<PathBuf>, Failure> {
     let Some(path) = job.keep_in.as_ref().filter(|_| !records.is_empty()) else {
         return Ok(None);
@@ -353,7 +353,7 @@ fn kept(job: &Job, plan: &Plan, records: &[RecordedSegment]) -> Result<Option<Pa
     Ok(Some(path.clone()))
 }
 
-/// The failure of an identification that was stopped: what is finished is kept, and the message says how to go on.
+/// The failure of a stopped identification: the finished segments are kept, and the message says how to continue.
 fn stopped(
     job: &Job,
     plan: &Plan,

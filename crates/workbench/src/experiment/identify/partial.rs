@@ -1,4 +1,4 @@
-//! The finished segments of an identification that was stopped, kept so that it can go on where it was.
+//! The file of finished segments with which a stopped identification continues.
 
 use cellpos_ident::experiment::{Plan, RecordedSegment};
 use cellpos_session::Failure;
@@ -9,7 +9,7 @@ use std::path::Path;
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Partial {
-    /// One description per planned segment: a plan with any difference is another experiment.
+    /// One description per planned segment: a plan with any difference is a different experiment.
     plan: Vec<String>,
     segments: Vec<Kept>,
 }
@@ -22,7 +22,7 @@ struct Kept {
     #[serde(default)]
     age_s: Option<f64>,
     input_um: Vec<Option<f64>>,
-    /// `null` where no frame showed the bead.
+    /// `null` if no frame showed the bead.
     output_um: Vec<Option<f64>>,
 }
 
