@@ -61,6 +61,8 @@ pub(super) struct Background {
     /// Pixels at which it is steep, and frames since they were chosen first.
     pub steep: Vec<u32>,
     pub steep_age: u32,
+    /// Level of each row when they were chosen, grey levels.
+    pub row_levels: Vec<f32>,
 }
 
 impl Background {
@@ -83,6 +85,7 @@ impl Background {
             change: vec![0.0; width],
             steep: Vec::with_capacity(SAMPLES),
             steep_age: 0,
+            row_levels: vec![0.0; height],
         }
     }
 
@@ -176,15 +179,16 @@ impl Background {
         let light = self.light_of(pixels);
         let step = (pixels.len() / 4096).max(1) | 1;
         let pairs = pixels.iter().zip(&self.mean).step_by(step);
-        let mut off: Vec<f32> = pairs.map(|(p, m)| f32::from(*p) - light * m).collect();
-        off.sort_unstable_by(f32::total_cmp);
-        let at = |share: f64| off.get((share * off.len() as f64) as usize);
-        if let (Some(low), Some(high)) = (at(0.25), at(0.75)) {
-            // Of whole grey levels, of which a quartile is no finer than one.
-            let noise = (0.741 * f64::from(high - low)).max(0.5);
-            if self.known_noise == 0.0 || noise < self.known_noise {
-                self.known_noise = noise;
-            }
+        let off: Vec<f32> = pairs.map(|(p, m)| f32::from(*p) - light * m).collect();
+        if off.is_empty() {
+            return;
+        }
+        let spread = 0.741 * (quantile(&off, 0.75) - quantile(&off, 0.25));
+        // Spread over its level, a value has the variance of an even distribution more.
+        let even = 1.0 / 12.0;
+        let noise = (spread * spread - even).max(even).sqrt();
+        if self.known_noise == 0.0 || noise < self.known_noise {
+            self.known_noise = noise;
         }
     }
 
@@ -357,6 +361,25 @@ impl Background {
             self.unlit.push(unlit);
         }
     }
+}
+
+/// Value below which a share of the values is, each of them a whole grey level, so anywhere within half of one.
+fn quantile(values: &[f32], share: f64) -> f64 {
+    let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(low, high), v| {
+        (low.min(*v), high.max(*v))
+    });
+    let (mut low, mut high) = (f64::from(low) - 0.5, f64::from(high) + 0.5);
+    while high - low > 1e-3 {
+        let middle = 0.5 * (low + high);
+        let below = |v: &f32| (middle - f64::from(*v) + 0.5).clamp(0.0, 1.0);
+        let sum: f64 = values.iter().map(below).sum();
+        if sum < share * values.len() as f64 {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    0.5 * (low + high)
 }
 
 /// The first stretch of a row (from, to), at or behind column `x`, that is near a region; stretches that overlap are one.

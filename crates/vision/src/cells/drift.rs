@@ -161,6 +161,10 @@ impl Background {
         }
         let (width, height) = (self.width, self.height());
         let least = 2.0 * self.noise_grey() as f32;
+        let rows = self.mean.chunks_exact(width.max(1));
+        for (level, row) in self.row_levels.iter_mut().zip(rows) {
+            *level = row.iter().sum::<f32>() / width as f32;
+        }
         self.steep.clear();
         if width < 16 || height < 16 {
             return;

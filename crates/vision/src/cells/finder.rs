@@ -1,7 +1,7 @@
 //! The finder: background, regions, outlines.
 
 use super::background::Background;
-use super::focus::{Last, Moved};
+use super::focus::{Last, Left, Moved};
 use super::regions::{Part, Regions, is_object};
 use super::softer::{MOST_REACH, Softer};
 use super::{Cell, CellConfig, CellError};
@@ -41,6 +41,8 @@ pub struct CellFinder {
     background: Background,
     /// Signed contrast of the last frame, grey levels.
     contrast: Vec<f32>,
+    /// Room for another explanation of it.
+    other: Vec<f32>,
     regions: Regions,
     outliner: Outliner,
     cells: Vec<Cell>,
@@ -106,6 +108,7 @@ impl CellFinder {
             height,
             background: Background::new(width, height),
             contrast: vec![0.0; width * height],
+            other: vec![0.0; width * height],
             regions: Regions::new(width, height, max_regions),
             outliner: Outliner::new(),
             cells: Vec::with_capacity(16 * max_regions),
@@ -304,19 +307,13 @@ impl CellFinder {
         let softer = &self.softer;
         self.moved = self.background.moved(softer, pixels, light, &mut self.last);
         self.outliner.expect_blur(self.moved.blur_px);
-        if self.moved.is_none() {
-            let means = pixels.iter().zip(&self.background.mean);
-            for (c, (p, m)) in self.contrast.iter_mut().zip(means) {
-                *c = f32::from(*p) - light * m;
-            }
-        } else {
-            let buffers = (self.contrast.as_mut_slice(), self.row.as_mut_slice());
-            self.background
-                .contrast_moved(pixels, light, self.moved, buffers);
-        }
-        self.background.calm(&mut self.contrast);
         let noise = self.noise_grey();
         let threshold = self.config.threshold_sigma * noise;
+        self.compare(pixels, self.moved);
+        if !self.last.is_noise {
+            self.compare_by_rows(pixels, threshold as f32);
+        }
+        self.background.calm(&mut self.contrast);
         let strong = (SEED * threshold).powi(2);
         self.regions
             .find(&self.contrast, self.width, threshold as f32, strong);
@@ -357,6 +354,48 @@ impl CellFinder {
                     _ => self.dust = self.dust.saturating_add(1),
                 }
             }
+        }
+    }
+}
+
+/// What a frame differs by from the background.
+impl CellFinder {
+    /// From the background moved and blurred.
+    fn compare<T: Copy>(&mut self, pixels: &[T], moved: Moved)
+    where
+        f32: From<T>,
+    {
+        let light = self.light;
+        if moved.is_none() {
+            let means = pixels.iter().zip(&self.background.mean);
+            for (c, (p, m)) in self.contrast.iter_mut().zip(means) {
+                *c = f32::from(*p) - light * m;
+            }
+        } else {
+            let buffers = (self.contrast.as_mut_slice(), self.row.as_mut_slice());
+            self.background
+                .contrast_moved(pixels, light, moved, buffers);
+        }
+    }
+
+    /// Without what whole rows differ by: from the moved background or from the one at rest, by whichever the walls are explained
+    /// better. What belongs to the camera does not move with the walls.
+    fn compare_by_rows<T: Copy>(&mut self, pixels: &[T], threshold: f32)
+    where
+        f32: From<T>,
+    {
+        self.background.take_off_rows(&mut self.contrast, threshold);
+        let explained = |left: &Option<Left>| left.as_ref().is_none_or(|left| left.is_noise);
+        let moved = self.background.left_in(&self.contrast);
+        if self.moved.is_none() || explained(&moved) {
+            return;
+        }
+        std::mem::swap(&mut self.contrast, &mut self.other);
+        self.compare(pixels, Moved::default());
+        self.background.take_off_rows(&mut self.contrast, threshold);
+        let cost = |left: Option<Left>| left.map_or(f64::INFINITY, |left| left.cost);
+        if cost(self.background.left_in(&self.contrast)) > cost(moved) {
+            std::mem::swap(&mut self.contrast, &mut self.other);
         }
     }
 }

@@ -70,6 +70,8 @@ impl Moved {
 pub(super) struct Last {
     pub moved: Moved,
     cost: f64,
+    /// Whether noise alone leaves as much.
+    pub is_noise: bool,
 }
 
 impl Last {
@@ -77,6 +79,7 @@ impl Last {
         Last {
             moved: Moved::default(),
             cost: f64::NAN,
+            is_noise: true,
         }
     }
 }
@@ -109,7 +112,7 @@ impl Background {
         let before = *last;
         *last = Last {
             moved: still,
-            cost: f64::NAN,
+            ..Last::none()
         };
         let light = f64::from(light);
         let Some(sharp) = self.left_by(softer, pixels, light, still) else {
@@ -119,7 +122,7 @@ impl Background {
         if sharp.is_noise {
             return still;
         }
-        last.cost = sharp.cost;
+        (last.cost, last.is_noise) = (sharp.cost, false);
         let as_before = |cost: f64| (cost - before.cost).abs() < BETTER;
         if !before.moved.is_fitted() && as_before(sharp.cost) {
             return still;
@@ -127,6 +130,7 @@ impl Background {
         let mut best = Last {
             moved: still,
             cost: sharp.cost - BETTER,
+            is_noise: false,
         };
         // Whether no more need be looked for.
         let mut take = |found: Option<(Moved, Left)>| {
@@ -138,6 +142,7 @@ impl Background {
                 best = Last {
                     moved,
                     cost: left.cost,
+                    is_noise: left.is_noise,
                 };
             }
             better && (left.is_noise || as_before(left.cost))
@@ -331,24 +336,19 @@ impl Background {
         f32: From<T>,
     {
         let reader = Reader::new(self, softer, moved.shift_px, moved.blur_px * moved.blur_px);
-        let noise = self.noise_grey();
-        let (mut cost, mut n, mut inner, mut outer) = (0.0, 0.0, 0.0, 0.0);
-        for k in self.steep.iter().step_by(self.steep_stride()) {
+        let steep = self.steep.iter().step_by(self.steep_stride());
+        let off = steep.filter_map(|k| {
             let k = *k as usize;
-            let Some([value, ..]) = reader.at(k) else {
-                continue;
-            };
-            let off = f64::from(f32::from(*pixels.get(k)?)) - light * f64::from(value);
-            let z2 = (off / noise).powi(2);
-            cost += z2 / (1.0 + z2 / (FAR * FAR));
-            inner += f64::from(u8::from(off.abs() < CALM.0.0 * noise));
-            outer += f64::from(u8::from(off.abs() < CALM.1.0 * noise));
-            n += 1.0;
-        }
-        (n >= FEWEST).then_some(Left {
-            cost: cost / n,
-            is_noise: inner >= CALM.0.1 * n && outer >= CALM.1.1 * n,
-        })
+            let [value, ..] = reader.at(k)?;
+            Some(f64::from(f32::from(*pixels.get(k)?)) - light * f64::from(value))
+        });
+        Left::of(off, self.noise_grey())
+    }
+
+    /// What a contrast leaves of the walls.
+    pub(super) fn left_in(&self, contrast: &[f32]) -> Option<Left> {
+        let walls = self.steep.iter().filter_map(|k| contrast.get(*k as usize));
+        Left::of(walls.map(|off| f64::from(*off)), self.noise_grey())
     }
 
     /// What a frame differs by from the background at `light`, moved and blurred, into `contrast`; `row` has room for a row and
@@ -385,7 +385,25 @@ impl Background {
 }
 
 /// How badly the pixels are explained, each on average, and whether noise alone leaves as much.
-struct Left {
-    cost: f64,
-    is_noise: bool,
+pub(super) struct Left {
+    pub cost: f64,
+    pub is_noise: bool,
+}
+
+impl Left {
+    /// Of what pixels are off, grey levels.
+    fn of(off: impl Iterator<Item = f64>, noise: f64) -> Option<Self> {
+        let (mut cost, mut n, mut inner, mut outer) = (0.0, 0.0, 0.0, 0.0);
+        for off in off {
+            let z2 = (off / noise).powi(2);
+            cost += z2 / (1.0 + z2 / (FAR * FAR));
+            inner += f64::from(u8::from(off.abs() < CALM.0.0 * noise));
+            outer += f64::from(u8::from(off.abs() < CALM.1.0 * noise));
+            n += 1.0;
+        }
+        (n >= FEWEST).then_some(Left {
+            cost: cost / n,
+            is_noise: inner >= CALM.0.1 * n && outer >= CALM.1.1 * n,
+        })
+    }
 }

@@ -4,6 +4,7 @@
 //! bright (or dark) halo about it is not counted as cell. Place, area, length and width are those of the surface within the
 //! outline, each with its variance. Allocates only when made.
 
+mod along;
 mod background;
 mod drift;
 mod finder;

@@ -19,6 +19,7 @@ mod suggested;
 mod touching;
 mod tracking;
 mod uncertainty;
+mod walls;
 
 /// Counts by thread, so that tests beside each other do not disturb one another.
 #[global_allocator]
