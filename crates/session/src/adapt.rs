@@ -1,4 +1,4 @@
-//! Adaptation of the loop to the plant: whether it is on, and its outcome in words.
+//! Adaptation of the loop to the plant: its switch, and its outcome in words.
 
 use cellpos_control::{AdaptMode, Adaptation, ControllerFile};
 use cellpos_runtime::life::EventKind;
@@ -21,7 +21,7 @@ pub fn choose(asked: Option<Adapt>, controller: &mut ControllerFile) {
     }
 }
 
-/// Where adaptation stands, in a line.
+/// The state of adaptation, in a line.
 pub fn text(now: &Adaptation) -> String {
     let mode = match now.mode {
         AdaptMode::Learning => "learning",
@@ -62,7 +62,7 @@ pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
     })
 }
 
-/// The sentence of [`EventKind::Adapted`]; nothing for another event.
+/// The sentence of [`EventKind::Adapted`]; `None` for another event.
 pub(crate) fn sentence(kind: &EventKind) -> String {
     let EventKind::Adapted {
         gain_before,

@@ -1,10 +1,10 @@
-//! Where threads belong that nothing of a run waits for.
+//! The CPUs for threads on which no part of a run waits.
 
 use cellpos_runtime::realtime::allowed_cpus;
 use rustix::thread::{CpuSet, sched_setaffinity};
 
-/// Keeps the calling thread off the CPU that the control thread is pinned to (the last one allowed), where there is another.
-/// Its policy stays the ordinary one.
+/// Keeps the calling thread off the CPU of the control thread (the last one allowed), if there is another. The thread keeps the
+/// ordinary scheduling policy.
 pub(crate) fn beside_the_loop() {
     let allowed = allowed_cpus();
     let Some((_, others)) = allowed
@@ -15,7 +15,7 @@ pub(crate) fn beside_the_loop() {
     };
     let mut set = CpuSet::new();
     others.iter().for_each(|cpu| set.set(*cpu));
-    // If refused, it shares all CPUs under the ordinary scheduler, below the loop's threads.
+    // If the system refuses, the thread shares all CPUs under the ordinary scheduler, below the loop's threads.
     let _ = sched_setaffinity(None, &set);
 }
 

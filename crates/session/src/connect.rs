@@ -36,7 +36,7 @@ pub fn meta(
     let mut meta = RunMeta::new(name, clock);
     meta.columns = columns(setup, file);
     meta.command_line = provenance::command_line();
-    // A folder that is gone is no reason not to run.
+    // Run even if the folder is gone.
     meta.started_in =
         std::env::current_dir().map_or_else(|_| String::new(), |path| path.display().to_string());
     meta.seed = file.is_emulated().then_some(file.emulator.seed);
@@ -51,7 +51,7 @@ pub fn meta(
     }
     meta.config = table(&setup.config)?;
     let mut anchored = anchored(file)?;
-    // The script's sample precedes that of the rig file.
+    // The script's sample overrides that of the rig file.
     let of_script = setup.config.reference.script()?;
     let of_script = of_script.map_or_else(Sample::default, |(script, _)| script.sample);
     let sample = of_script.or(&anchored.sample.unwrap_or_default());
@@ -74,7 +74,7 @@ pub fn meta(
     Ok(meta)
 }
 
-/// The columns that a run needs: what nobody measures or computes takes no room on the disk.
+/// The columns that a run needs. A quantity that is neither measured nor computed takes no room on the disk.
 fn columns(setup: &Setup, file: &RigFile) -> Vec<Group> {
     let mpc = setup.controller.controller == ControllerKind::Mpc;
     let script = matches!(setup.config.reference, ReferenceSpec::Script { .. });
@@ -92,10 +92,10 @@ fn columns(setup: &Setup, file: &RigFile) -> Vec<Group> {
     .collect()
 }
 
-/// Refuses a run for which the disk has no room; `ticks`: as many as it will have at most, if it has an end.
+/// Refuses a run for which the disk has no room; `ticks`: its largest number of ticks, if it has an end.
 ///
 /// # Errors
-/// A failure with what is needed and what is there.
+/// A failure that names the needed and the free space.
 pub fn room(root: &Path, ticks: Option<u64>, meta: &RunMeta) -> Result<(), Failure> {
     space::check(root, ticks, &meta.columns).map_err(Failure::input)
 }
@@ -127,7 +127,7 @@ fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
         *socket = absolute(socket)?;
     }
     if let ActuatorConfig::Serial { port, .. } = &mut file.actuator
-        // Else it is a name of the system's own (COM5).
+        // Otherwise it is a name of the operating system (COM5).
         && Path::new(port).exists()
     {
         *port = absolute(Path::new(port))?.display().to_string();
@@ -140,7 +140,7 @@ fn anchored(file: &RigFile) -> Result<RigFile, Failure> {
     Ok(file)
 }
 
-/// The files behind the options `--rig`, `--model` and `--controller`, and those that the rig file names.
+/// The files of the options `--rig`, `--model` and `--controller`, and the files that the rig file names.
 pub fn inputs<'a>(
     rig: Option<&'a Path>,
     file: &'a RigFile,
@@ -171,7 +171,7 @@ pub const ENDED: &str = "ended";
 pub struct Kept {
     /// Its path.
     pub run: String,
-    /// Whether everything of the run is in it.
+    /// Whether it holds the whole run.
     pub whole: bool,
 }
 
@@ -189,7 +189,7 @@ pub fn finish(
         end.summary.insert(ENDED.to_string(), ended);
     }
     writer.add_conditions(provenance::granted(conditions));
-    // Those that never came to the writer; it adds its own.
+    // Rows that never reached the writer; it adds its own losses.
     end.rows_lost = summary.records_lost;
     end.events_lost = summary.events_lost;
     let done = writer.finish(end);
@@ -233,13 +233,13 @@ pub fn not_armed(writer: RunWriter, failure: &Failure) {
     let mut end = RunEnd::new("not-armed");
     end.summary
         .insert("why".to_string(), toml::Value::String(failure.text()));
-    // The user sees the failure itself.
+    // The user sees the failure anyway.
     let _ = writer.finish(end);
 }
 
-/// Smallest RMS error that any controller could reach, nm: Brownian motion and noise in force, with the delay that the run measured,
-/// not the one that was set. `None` where the run did better than that: then diffusion or noise are not what is stated, and the
-/// figure would be no bound.
+/// Smallest RMS error that any controller could reach, nm: from the assumed Brownian motion and noise, with the delay that the run
+/// measured, not the configured one. `None` if the run did better: then the stated diffusion or noise is wrong, and the figure is not a
+/// bound.
 pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<f64> {
     /// Time over which the error of a hold is correlated, s: a loop of 30 Hz or so.
     const CORRELATED_S: f64 = 0.005;
@@ -275,11 +275,11 @@ pub(crate) fn bound_of_um(setup: &Setup, diffusion: f64, noise_um: f64, delay_s:
     }
 }
 
-/// What is wrong when the frames of a run were not as old as the rig file says: the loop was made for another delay.
+/// The warning if the frames of a run were not as old as the rig file says: the loop was designed for another delay.
 pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
-    /// Fewer ticks are of the first frames, which waited for the loop to begin.
+    /// A shorter run holds mostly the first frames, which waited for the loop to begin.
     const FEWEST_TICKS: u64 = 100;
-    // Without a frame that was used nothing is known of their age: the delay is that of the hold alone.
+    // If no frame was used, their age is unknown, and the delay is that of the hold alone.
     if summary.exposure_to_command_us.max <= 0.0 || summary.counts.ticks < FEWEST_TICKS {
         return None;
     }
@@ -309,8 +309,7 @@ fn partner_warning(summary: &Summary) -> Option<String> {
     })
 }
 
-/// Possible causes of a gain that differs from the model's. Positions in pixels times a wrong pixel size are a gain wrong by the
-/// same factor.
+/// Possible causes of a gain that differs from the model's. A wrong pixel size changes the gain by the same factor.
 fn gain_warning(ratio: f64, calibration: Option<&Calibration>) -> String {
     let pixel = calibration.map_or_else(String::new, |c| {
         format!(

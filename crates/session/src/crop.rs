@@ -1,4 +1,4 @@
-//! The part of a frame about what is followed, as page and clips show it.
+//! The part of a frame around the bead or cell, as page and clips show it.
 
 use cellpos_rig::SeenFrame;
 use std::ops::Range;
@@ -30,7 +30,7 @@ impl Crop {
         }
     }
 
-    /// Where its rows lie among the frame's pixels.
+    /// Ranges of its rows among the frame's pixels.
     pub(crate) fn rows(&self) -> impl Iterator<Item = Range<usize>> + use<> {
         let Self {
             origin: (left, top),
@@ -40,7 +40,7 @@ impl Crop {
         (top..top + height).map(move |row| row * stride + left..row * stride + left + width)
     }
 
-    /// A place of the frame, in the crop.
+    /// A position of the frame, in the crop's coordinates.
     pub(crate) fn place(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (x - self.origin.0 as f64, y - self.origin.1 as f64)
     }

@@ -1,4 +1,4 @@
-//! The devices of a rig in the hand of whoever armed them.
+//! The devices of a rig in the hands of the session that armed them.
 
 use crate::failure::Failure;
 use crate::rig_file::{ClockKind, Connected, Frames};
@@ -6,10 +6,10 @@ use cellpos_rig::{ActuatorFault, ActuatorReport, ActuatorState};
 use std::hash::{BuildHasher, Hasher};
 use std::time::Duration;
 
-/// How a rig is to be used.
+/// Options for the use of a rig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Options {
-    /// Which clock (an emulated rig may run on either).
+    /// The clock (an emulated rig may run on either).
     pub clock: ClockKind,
     /// Whether an emulated rig renders frames.
     pub frames: Frames,
@@ -51,7 +51,7 @@ impl Devices {
     pub(crate) fn disarm(&mut self) {
         if std::mem::take(&mut self.armed) {
             let actuator = self.connected.actuator.as_mut();
-            // Whatever fails here, the board's own watchdog does the same.
+            // If this fails, the board's own watchdog does the same.
             if actuator.freeze().is_ok() && !self.connected.clock.is_virtual() {
                 std::thread::sleep(Duration::from_millis(20));
             }
@@ -66,7 +66,7 @@ impl Drop for Devices {
     }
 }
 
-/// What the board answered to `arm` must be: armed, and the displacement that it had.
+/// Checks the board's answer to `arm`: it must be armed, at the displacement that it had.
 pub(crate) fn check_armed(
     report: &ActuatorReport,
     session: u16,
@@ -94,7 +94,7 @@ pub(crate) fn check_armed(
     Ok(())
 }
 
-/// A number that another host is unlikely to have chosen, never 0.
+/// A session number that another host is unlikely to choose, never 0.
 pub(crate) fn session_number() -> u16 {
     // The standard library seeds its hashers from the operating system.
     let random = std::collections::hash_map::RandomState::new()

@@ -1,4 +1,4 @@
-//! How a run ended, in sentences: what was seen, what was expected, what to do.
+//! The end of a run in sentences: observation, expectation, remedy.
 
 use crate::failure::{Failure, describe};
 use crate::words::{is_odd, of_what_is_followed, safe_reason};
@@ -11,21 +11,21 @@ use cellpos_runtime::{
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// The kinds of end that a program may want to steer by.
+/// The kinds of end, for programs that react to them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EndKind {
-    /// It ran as long as it was to.
+    /// It ran for its whole time.
     Done,
     /// The reference generator came to its end: a script, an excitation.
     ReferenceOver,
     /// The operator ended it; the bead was frozen, then the PZT parked.
     Operator,
-    /// The loop was never closed: the plant did not answer the arming pulse as the model says, or no bead was seen.
+    /// The loop was never closed: the plant did not respond to the arming pulse as the model predicts, or no bead was seen.
     ArmingRefused,
-    /// It ran as long as it was to, and did not keep its bead.
+    /// It ran for its whole time, but did not keep its bead.
     NotKept,
-    /// The loop went safe while it ran.
+    /// The loop went to Safe during the run.
     Safe,
     /// The run could no longer be recorded.
     Unrecorded,
@@ -38,20 +38,20 @@ pub enum EndKind {
 pub struct Ended {
     /// In a word.
     pub kind: EndKind,
-    /// Why arming was refused, where it was.
+    /// Why arming was refused, if it was.
     pub refusal: Option<Refusal>,
-    /// Why Safe was latched, where it was.
+    /// Why Safe was latched, if it was.
     pub reason: Option<SafeReason>,
     /// What was seen.
     pub seen: String,
-    /// What was expected; empty where nothing went wrong.
+    /// The expectation; empty if nothing went wrong.
     pub expected: String,
-    /// What to do; empty if nothing.
+    /// The remedy; empty if there is nothing to do.
     pub to_do: String,
 }
 
 impl Ended {
-    /// Whether it ended as it was asked to.
+    /// Whether it ended as requested.
     pub fn as_asked(&self) -> bool {
         matches!(
             self.kind,
@@ -59,8 +59,8 @@ impl Ended {
         )
     }
 
-    /// Whether the cause may be over by now, as a stall of this machine or of the line: another run may then succeed without a
-    /// person's action. A bead that is lost or a board in the hands of another program is not that.
+    /// Whether the cause may be over by now, for example a stall of this machine or of the line. Another run may then succeed
+    /// without a person's action. A lost bead, or a board that another program holds, is not such a cause.
     pub fn may_pass(&self) -> bool {
         self.refusal == Some(Refusal::Disturbed)
             || matches!(
@@ -80,7 +80,7 @@ impl Ended {
 }
 
 impl Ended {
-    /// As the failure of a command that needed another end; `help` says how to go on.
+    /// The failure of a command that needed another end; `help` says how to continue.
     pub fn failure(&self, help: &str) -> Failure {
         let advice = [self.to_do.as_str(), help];
         let advice = advice.iter().filter(|part| !part.is_empty());
@@ -105,11 +105,11 @@ impl fmt::Display for Ended {
     }
 }
 
-/// The last of what says why a run ended, gathered from its events.
+/// The last event of each kind that explains the end of a run.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Clues {
     arming: Option<(Refusal, f64, f64)>,
-    /// Gain over the model's, and half its 95 % interval, of a pulse that was accepted.
+    /// Gain over the model's, and half its 95 % interval, from an accepted pulse.
     passed: Option<(f64, f64)>,
     /// Tick of the refusal.
     refused_at: u64,
@@ -146,7 +146,7 @@ impl Clues {
     }
 }
 
-/// What the loop was set up to expect.
+/// The expectations of the loop's set-up.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Expected {
     pub(crate) timing: Timing,
@@ -155,11 +155,11 @@ pub(crate) struct Expected {
     pub(crate) cell: bool,
 }
 
-/// What to do when no cell is found: the cell is the difference from the background.
+/// Remedy if no cell is found: vision sees a cell as the difference from the background.
 const NO_CELL: &str = "bring a cell into view and into focus, then start again; if one is in view, the background may be of another \
     region, light or focus: record the empty channel again (cellpos background)";
 
-/// Three sentences: seen, expected, what to do.
+/// Three sentences: observation, expectation, remedy.
 type Sentences = (String, String, String);
 
 fn sentences(seen: impl Into<String>, expected: impl Into<String>, to_do: &str) -> Sentences {
@@ -167,14 +167,14 @@ fn sentences(seen: impl Into<String>, expected: impl Into<String>, to_do: &str) 
 }
 
 impl Clues {
-    /// Gain over the model's, where the arming pulse was accepted and the gain is nevertheless not the model's.
+    /// Gain over the model's, if the arming pulse was accepted but the gain differs from the model's.
     pub(crate) fn odd_gain(&self) -> Option<f64> {
         (self.passed)
             .filter(|(ratio, ci95)| is_odd(*ratio, *ci95))
             .map(|(ratio, _)| ratio)
     }
 
-    /// How a run ended, by its summary, its trouble and these clues.
+    /// The end of a run, from its summary, its trouble and these clues.
     pub(crate) fn ended(
         &self,
         summary: &Summary,
@@ -428,7 +428,7 @@ fn clipped(level_um: Option<f64>) -> Sentences {
     )
 }
 
-/// A run that came to its end without the bead that it was to keep.
+/// A run that reached its end but had lost the bead that it was to keep.
 fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
     let within_um = kept.held_within_nm.unwrap_or(f64::NAN) * 1e-3;
     let held = kept.held_percent.map_or_else(String::new, |percent| {

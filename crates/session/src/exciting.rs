@@ -10,16 +10,16 @@ pub const SETTLE_TICKS: usize = 500;
 /// frozen there.
 pub const REST_TICKS: usize = 400;
 
-/// Holds the bead at 0 um and plays the excitation, counted from where the loop was closed.
+/// Holds the bead at 0 um and plays the excitation, counted from the tick in which the loop was closed.
 ///
-/// A segment in which the bead is frozen is invalid; its rest is not played. The bead that is found again is caught
-/// by a loop at rest, not by one that is being shaken, and the next segment begins from there.
+/// If the bead is frozen, the segment is invalid and its rest is not played. So a loop at rest catches the bead that is found
+/// again, and the next segment begins from there.
 #[derive(Debug, Clone)]
 pub struct Exciting {
     excitation_um: Vec<f64>,
     /// First tick of each segment.
     starts: Vec<usize>,
-    /// Until when nothing is played.
+    /// Tick up to which nothing is played.
     quiet_until: usize,
     now: Option<usize>,
 }
@@ -82,7 +82,7 @@ impl ReferenceGenerator for Exciting {
 mod tests {
     use super::*;
 
-    /// What two segments of three ticks each play, with the bead frozen in some ticks, and when they are over.
+    /// Output of two segments of three ticks each, with the bead frozen in some ticks, and the tick of their end.
     fn played(frozen: impl Fn(usize) -> bool) -> (Vec<f64>, usize) {
         let mut exciting = Exciting::playing(vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], vec![0, 3]);
         let mut all = Vec::new();

@@ -1,13 +1,13 @@
-//! Why a session could not do its work.
+//! The failure of a session's call.
 
 use cellpos_runtime::RunError;
 
-/// Why something could not be done.
+/// The reason of a failure.
 #[derive(Debug)]
 pub enum Failure {
-    /// The user can put it right: a file, key, value or argument. Exit code 2.
+    /// The user can correct it: a file, key, value or argument. Exit code 2.
     BadInput(miette::Report),
-    /// Something failed on the way: a device, a full disk, the loop. Exit code 1.
+    /// Something failed during the work: a device, a full disk, the loop. Exit code 1.
     Failed(miette::Report),
 }
 
@@ -17,7 +17,7 @@ impl Failure {
         Self::BadInput(miette::miette!(help = help.to_string(), "{error}"))
     }
 
-    /// A failure on the way, in the words of its error and of the errors behind it.
+    /// A failure during the work, in the words of its error and of the errors that caused it.
     pub fn failed(error: impl std::error::Error + Send + Sync + 'static) -> Self {
         Self::Failed(miette::Report::from_err(error))
     }
@@ -62,7 +62,7 @@ impl std::error::Error for Failure {
     }
 }
 
-/// An error with what is behind it and not said by it already, on one line.
+/// An error and its causes on one line, without repetitions.
 pub fn describe(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();

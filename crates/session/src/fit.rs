@@ -36,7 +36,7 @@ pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
 
 /// Ticks per frame of a camera that is slower than the loop; 1 if it is about as fast.
 fn ticks_per_fix(period_us: f64, rate_hz: f64) -> f64 {
-    /// A camera that is off by less is meant to be as fast.
+    /// A camera whose rate is off by less counts as equally fast.
     const AS_FAST: f64 = 1.25;
     let ticks = 1e6 / (period_us * rate_hz);
     if ticks.is_finite() && ticks >= AS_FAST {
@@ -46,7 +46,7 @@ fn ticks_per_fix(period_us: f64, rate_hz: f64) -> f64 {
     }
 }
 
-/// How long a frame is exposed, s, where the rig file says so.
+/// Exposure of a frame, s, if the rig file states it.
 pub fn stated_exposure_s(file: &RigFile) -> Option<f64> {
     match &file.camera {
         CameraConfig::Emulated {} => Some(file.emulator.exposure_ms * 1e-3),
@@ -55,7 +55,7 @@ pub fn stated_exposure_s(file: &RigFile) -> Option<f64> {
     }
 }
 
-/// How long a frame is exposed, s: as the rig file says, else as the model does; 0 where nobody does.
+/// Exposure of a frame, s, from the rig file, else from the model; 0 if neither states it.
 fn exposure_s(file: &RigFile, model: &Model) -> f64 {
     let of_model = || {
         model.effects.iter().find_map(|effect| match effect.act() {
@@ -66,7 +66,7 @@ fn exposure_s(file: &RigFile, model: &Model) -> f64 {
     stated_exposure_s(file).or_else(of_model).unwrap_or(0.0)
 }
 
-/// Model and controller by their options, before a board is known.
+/// Model and controller from their options, before a board is known.
 pub fn prepare(model: &str, controller: &str, file: &RigFile) -> Result<Prepared, Failure> {
     let model = Model::load(model).map_err(Failure::input)?;
     let model = file.actuator.before(model);
@@ -74,7 +74,7 @@ pub fn prepare(model: &str, controller: &str, file: &RigFile) -> Result<Prepared
     Ok(Prepared { model, controller })
 }
 
-/// Diffusion of the bead, um^2/s: of the emulated rig, or as the model says.
+/// Diffusion of the bead, um^2/s, from the emulated rig or from the model.
 pub(crate) fn diffusion_um2_per_s(file: &RigFile, model: &cellpos_plant::Model) -> f64 {
     if file.is_emulated() {
         file.emulator.diffusion_um2_per_s

@@ -1,14 +1,14 @@
-//! How the frames of a camera come, before anything is armed.
+//! Rate and age of a camera's frames, before anything is armed.
 
 use crate::failure::Failure;
 use cellpos_rig::{Clock, PositionSource};
 
-/// How the frames of a camera come, by their own ids and time stamps.
+/// Rate and age of a camera's frames, from their own ids and time stamps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FramesSeen {
     /// Frames a second; 0 with fewer than two.
     pub rate_hz: f64,
-    /// From the middle of their exposure to when they may be used, vision included, ms, median.
+    /// From the middle of an exposure until the loop can use its frame, vision included, ms, median.
     pub age_ms: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! A rig in hand, from its file to the end of a run.
+//! A rig in use, from its file to the end of a run.
 //!
 //! A run goes through four types:
 //!
@@ -7,12 +7,12 @@
 //! 3. [`Running`]: the loop runs on its own threads.
 //! 4. [`Finished`]: parked; it says how the run ended.
 //!
-//! The board is armed last, when everything else is ready. The value that holds it parks it on drop: on an error, on a panic,
-//! at the end. Real-time rights and locked memory end with the run. A program calls [`signals::listen`] first; then Ctrl-C
+//! The session arms the board last, when everything else is ready. The value that holds the board parks it on drop: at the end, on an
+//! error and on a panic. Real-time rights and locked memory end with the run. A program calls [`signals::listen`] first; then Ctrl-C
 //! freezes and parks.
 //!
-//! [`RigFile`] is rig.toml. [`setup`] joins model, controller and reference; [`recording`] makes the run folder; [`view`] serves the
-//! live page. [`Ended`] and [`EndKind`] say how a run ended, [`Failure`] why a call was refused.
+//! [`RigFile`] is rig.toml. [`setup`] joins model, controller and reference; [`recording`] makes the run folder; [`view`] serves the live
+//! page. [`Ended`] and [`EndKind`] say how a run ended, [`Failure`] says why a call was refused.
 //!
 //! ```
 //! use cellpos_runtime::{EndRule, NoSink};
@@ -72,7 +72,7 @@ pub use frames_seen::FramesSeen;
 pub use rig::{Armed, Finished, NotArmed, Rig, Running};
 pub use rig_file::RigFile;
 
-/// The Rust of the book is compiled and run.
+/// The Rust examples of the book, compiled and run as tests.
 #[cfg(doctest)]
 #[doc = include_str!("../../../docs/embed.md")]
 #[doc = include_str!("../../../docs/extend.md")]

@@ -1,9 +1,9 @@
-//! The line of a run on the terminal: what matters most comes first, and what does not fit is left out.
+//! The line of a run on the terminal. The most important part comes first; parts without room are left out.
 
 use cellpos_runtime::{Life, Statistics, TickFlags, TickRecord};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// What the live line needs to know.
+/// Data of the live line.
 #[derive(Debug, Clone, Default)]
 pub struct LiveLine {
     /// Smallest displacement, um.
@@ -21,7 +21,7 @@ pub struct LiveLine {
 pub struct Typed(Arc<Mutex<String>>);
 
 impl Typed {
-    /// Puts a text in place of the one before.
+    /// Replaces the text.
     pub fn set(&self, text: &str) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = text.to_string();
     }
@@ -35,7 +35,7 @@ impl Typed {
     }
 }
 
-/// A part of a line: how soon it is left out when there is no room (the largest first), and its text.
+/// A part of a line: its rank (without room, the largest rank is left out first) and its text.
 type Part = (u8, String);
 
 impl LiveLine {

@@ -1,4 +1,4 @@
-//! Model and controller, before anything is known of where the rig stands.
+//! Model and controller, before the rig's displacement is known.
 
 use cellpos_control::ControllerFile;
 use cellpos_plant::Model;
@@ -6,7 +6,7 @@ use cellpos_plant::Model;
 /// Model and controller, before the board is armed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prepared {
-    /// The plant that the controller believes in.
+    /// The plant that the controller assumes.
     pub model: Model,
     /// Controller, estimator and limits.
     pub controller: ControllerFile,

@@ -1,17 +1,17 @@
-//! What a run was made with: program, machine, devices.
+//! The provenance of a run: program, machine, devices.
 
 use crate::Rig;
 use cellpos_runtime::realtime::Conditions;
 
 /// Version of the program.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// The commit that it was built from (the newest one at the time; what was changed since and not committed is not in it).
+/// The newest commit at the time of the build; uncommitted changes are not in it.
 pub const COMMIT: &str = env!("CELLPOS_COMMIT");
 /// Both in a line.
 pub const VERSION_AND_COMMIT: &str =
     concat!(env!("CARGO_PKG_VERSION"), " (", env!("CELLPOS_COMMIT"), ")");
 
-/// The command line, word by word; bytes that are no text are shown as such.
+/// The command line, word by word; bytes that are not text are shown as bytes.
 pub fn command_line() -> Vec<String> {
     std::env::args_os()
         .map(|word| word.to_string_lossy().into_owned())
@@ -70,7 +70,7 @@ pub fn machine(rig: &Rig) -> toml::Table {
     table
 }
 
-/// What the operating system granted: known once the control thread runs.
+/// The rights that the operating system granted, known once the control thread runs.
 pub fn granted(conditions: &Conditions) -> toml::Table {
     let mut table = toml::Table::new();
     let mut granted = toml::Table::try_from(conditions).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! The quantities of rig.toml that may be written with a unit (`park = "20um"`), and the line in which a key stands.
+//! The quantities of rig.toml that may be written with a unit (`park = "20um"`), and the lines of its keys.
 
 use crate::{Failure, toml_file};
 use cellpos_plant::quantities::{Quantity, bare};
@@ -9,7 +9,7 @@ const fn q(table: &'static str, plain: &'static str, with_unit: &'static str) ->
     Quantity::new(table, plain, with_unit)
 }
 
-/// Those of the host's own tables.
+/// The quantities of the host's own tables.
 const OF_THE_HOST: [Quantity; 37] = [
     q("", "first_neutral", "first_neutral_um"),
     q("", "near", "near_um"),
@@ -50,7 +50,7 @@ const OF_THE_HOST: [Quantity; 37] = [
     q("sample", "channel_width", "channel_width_um"),
 ];
 
-/// All of rig.toml: of the host's tables, and of `[board]` and `[emulator]`.
+/// All quantities of rig.toml: those of the host's tables, and of `[board]` and `[emulator]`.
 pub fn quantities() -> impl Iterator<Item = Quantity> {
     OF_THE_HOST.into_iter().chain(cellpos_emulator::QUANTITIES)
 }
@@ -77,8 +77,8 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
     toml_file::parse(&text, &name)
 }
 
-/// The line of a key in a file, counted from 1: of a table (empty: none), or wherever it stands first (`None`). A key with its
-/// unit is found where the quantity is written without, too.
+/// The line of a key in a file, counted from 1: in a table (empty: outside of tables), or at its first occurrence (`None`). A key
+/// with a unit in its name also finds the quantity without it.
 pub fn line_of(text: &str, table: Option<&str>, key: &str) -> Option<usize> {
     let plain = quantities()
         .find(|known| known.with_unit == key && table.is_none_or(|table| table == known.table))
@@ -93,7 +93,7 @@ pub fn line_of(text: &str, table: Option<&str>, key: &str) -> Option<usize> {
                 .next()
                 .unwrap_or("")
                 .trim();
-            // A table that is a key of another one, or of none.
+            // A table written as a key of another table, or at the top.
             let (of, name) = inside.rsplit_once('.').unwrap_or(("", inside));
             if name == key && table.is_none_or(|table| table == of) {
                 return Some(at + 1);

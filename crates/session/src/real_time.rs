@@ -1,17 +1,17 @@
-//! Real-time rights that end with the run they were asked for.
+//! Real-time rights that end with the run that requested them.
 //!
-//! The loop's threads ask for SCHED_FIFO themselves ([`cellpos_runtime::realtime`]) and end with the run; the thread that drives
-//! the board exists for the run only, too. So the caller's thread and its later work (Parquet, a search, a second run) are never
-//! changed. Locked memory belongs to the process: it is locked before the board is armed, because that takes time for a large
-//! process, and released after the run.
+//! The loop's threads request SCHED_FIFO themselves ([`cellpos_runtime::realtime`]) and end with the run, as does the thread that
+//! drives the board. So the caller's thread and its later work (Parquet, a search, a second run) keep their priority. Locked
+//! memory belongs to the process. The session locks it before it arms the board, because that takes time in a large process, and
+//! releases it after the run.
 
 use rustix::mm::{MlockAllFlags, mlockall, munlockall};
 use std::sync::{Mutex, PoisonError};
 
-/// Sessions that want the memory locked.
+/// Number of sessions that need locked memory.
 static WANTED: Mutex<usize> = Mutex::new(0);
 
-/// All memory locked, present and future; the last one dropped lets it go. A lock that was there before stays.
+/// Keeps all present and future memory locked; the last one dropped releases it. An earlier lock remains.
 #[derive(Debug)]
 pub(crate) struct LockedMemory {
     _private: (),
@@ -28,7 +28,8 @@ pub(crate) fn locked_kb() -> u64 {
 }
 
 impl LockedMemory {
-    /// Locks it; `None` where that was refused (the conditions of the run say so) or was done before by somebody else.
+    /// Locks it; `None` if the system refused (the conditions of the run say so) or if the memory was locked before by other
+    /// code.
     pub(crate) fn lock() -> Option<Self> {
         let mut wanted = WANTED.lock().unwrap_or_else(PoisonError::into_inner);
         if *wanted == 0 && locked_kb() > 0 {

@@ -10,7 +10,7 @@ use cellpos_record::{RunMeta, RunReader};
 /// The loop as the run folder describes it.
 ///
 /// # Errors
-/// `run.toml` is damaged, or of a loop that this version cannot build.
+/// `run.toml` is damaged, or describes a loop that this version cannot build.
 pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
     let meta = reader.meta().map_err(|problem| {
         Failure::bad_input(
@@ -28,7 +28,7 @@ pub fn setup(reader: &RunReader) -> Result<Setup, Failure> {
 /// The loop as the metadata of a run describe it; `name` is what errors call them.
 ///
 /// # Errors
-/// A loop that this version cannot build.
+/// The loop cannot be built by this version.
 pub fn setup_of(meta: &RunMeta, name: &str) -> Result<Setup, Failure> {
     let mut config = meta.config.clone();
     config.remove("rig");
@@ -55,7 +55,7 @@ pub fn followed_a_cell(meta: &RunMeta) -> bool {
     place.is_some_and(|place| place.get("cell").is_some())
 }
 
-/// Diffusion coefficient of the bead, um^2/s: the emulator's, or the model's where the rig was real.
+/// Diffusion coefficient of the bead, um^2/s: from the emulator, or for a real rig from the model.
 pub fn diffusion_of_run_um2_per_s(meta: &RunMeta) -> Option<f64> {
     let place = match emulated(meta) {
         Some(world) => world,

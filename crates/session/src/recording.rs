@@ -1,4 +1,4 @@
-//! Where the recorder thread's rows go: the run folder, and the live line on the terminal.
+//! The sink of the recorder thread: the run folder, and the live line on the terminal.
 
 use crate::live_line::LiveLine;
 use crate::view::{EventLine, Shown};
@@ -20,7 +20,7 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// A recording into a folder, with a live line unless it is unwanted or nobody would see it.
+    /// A recording into a folder, with a live line unless it is switched off or there is no terminal.
     pub fn new(writer: Option<RunWriter>, line: Option<LiveLine>) -> Self {
         Self {
             writer,
@@ -78,7 +78,7 @@ impl Recording {
     /// The run folder's writer, to be finished.
     pub fn into_writer(self) -> Option<RunWriter> {
         if self.line.is_some() {
-            // The last line stays above the command's output.
+            // The last line remains above the command's output.
             cellpos_live::terminal::stderr().leave();
         }
         self.writer

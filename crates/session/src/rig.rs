@@ -1,4 +1,4 @@
-//! A rig in hand, as types: [`Rig`] -> [`Armed`] -> [`Running`] -> [`Finished`].
+//! The states of a rig as types: [`Rig`] -> [`Armed`] -> [`Running`] -> [`Finished`].
 
 use crate::devices::{Devices, Options, check_armed, session_number};
 use crate::ended::{Clues, Ended, Expected};
@@ -40,15 +40,14 @@ impl Rig {
     /// Connects camera and board. Nothing moves.
     ///
     /// # Errors
-    /// A value of the rig file that cannot be, or a device that does not answer.
+    /// An invalid value in the rig file, or a device that does not answer.
     pub fn open(file: RigFile, options: Options) -> Result<Self, Failure> {
         let connected = file.connect(options.clock, options.frames)?;
         Ok(Self::of(file, options, connected))
     }
 
-    /// A rig of devices that no rig file knows: any stream of positions, any actuator. Of `file` the loop's part is taken:
-    /// limits, times, arming. `clock` is the one that the stamps of the positions are of; if it is virtual, no device may wait
-    /// for the machine's clock.
+    /// A rig of devices that no rig file describes: any stream of positions, any actuator. From `file` it takes the loop's part:
+    /// limits, times, arming. The positions are stamped by `clock`; if it is virtual, no device may wait for the machine's clock.
     ///
     /// # Errors
     /// Never in practice: the nominal model is built in.
@@ -101,12 +100,12 @@ impl Rig {
         self.devices.connected.source.info()
     }
 
-    /// Shows each new frame to `watch` from now on; `false` where the rig has no frames.
+    /// Shows each new frame to `watch` from now on; `false` if the rig has no frames.
     pub fn watch(&mut self, watch: Box<dyn FrameWatch>) -> bool {
         self.devices.connected.source.watch(watch)
     }
 
-    /// Takes the frames of `span_ns` and says how they come; before the rig is armed.
+    /// Measures rate and age of the frames for `span_ns`. Call it before the rig is armed.
     ///
     /// # Errors
     /// The camera delivers nothing more.
@@ -115,7 +114,7 @@ impl Rig {
         FramesSeen::of(connected.source.as_mut(), &connected.clock, span_ns)
     }
 
-    /// Who may ask the next run on this rig for freeze, park, pause.
+    /// The handle that requests freeze, park and pause of the next run on this rig.
     pub fn operator(&self) -> &Arc<Operator> {
         &self.operator
     }
@@ -129,7 +128,7 @@ impl Rig {
     /// [`Rig::fit`] does.
     ///
     /// # Errors
-    /// No such model or controller, or one that is made for another delay.
+    /// No such model or controller, or one made for another delay.
     pub fn prepare(&self, model: &str, controller: &str) -> Result<Prepared, Failure> {
         let mut prepared = fit::prepare(model, controller, &self.file)?;
         self.fit(&mut prepared);
@@ -143,8 +142,7 @@ impl Rig {
         fit::narrow(prepared, &self.file, &self.devices.connected);
     }
 
-    /// Completes the set-up with where the PZT stands. A PZT that is still on its way to park is waited for, at most ten
-    /// seconds.
+    /// Completes the set-up with the PZT's displacement. If the PZT is still moving to park, it waits at most ten seconds.
     ///
     /// # Errors
     /// The board cannot be read, or the PZT does not come to rest.
@@ -192,7 +190,7 @@ impl Rig {
         })
     }
 
-    /// Where the PZT stands, um; `None` where the board says nothing before it is armed (it is at park then).
+    /// Displacement of the PZT, um; `None` if the board reports nothing before it is armed (it is then at park).
     fn standing_um(&mut self) -> Result<Option<f64>, Failure> {
         const PATIENCE: Duration = Duration::from_secs(10);
         const SILENCE: Duration = Duration::from_millis(300);
@@ -291,8 +289,8 @@ impl Rig {
         let session = ArmRequest {
             session: id,
             park_um: limits.park_um,
-            // The rig's own slew limit: a controller may ask for less from tick to tick, but its command should be reached
-            // as early in the tick as the rig allows.
+            // Use the rig's own slew limit. A controller may have a smaller one from tick to tick, but the PZT should reach each
+            // command as early in the tick as the rig allows.
             limits: [
                 limits.low_um,
                 limits.high_um,
@@ -304,7 +302,7 @@ impl Rig {
         self.fresh = false;
         let expected_um = setup.config.displacement_um;
         if let Err(failure) = self.arm_board(&session, expected_um, own.step_um) {
-            // While the place is held: no signal ends the program before the board is parked.
+            // While this is held, no signal ends the program before the board is parked.
             self.devices.disarm();
             return Err(failure);
         }
@@ -317,7 +315,7 @@ impl Rig {
         expected_um: f64,
         step_um: f64,
     ) -> Result<(), Failure> {
-        // From here on the board may be armed, whatever it answers.
+        // From here on the board may be armed, whatever its answer.
         self.devices.armed = true;
         let actuator = self.devices.connected.actuator.as_mut();
         let report = actuator.arm(request).map_err(Failure::failed)?;
@@ -359,12 +357,12 @@ where
     R: ReferenceGenerator + Send + 'static,
     S: RunSink + 'static,
 {
-    /// Who may ask for freeze, park, pause.
+    /// The handle that requests freeze, park and pause.
     pub fn operator(&self) -> &Arc<Operator> {
         &self.rig.operator
     }
 
-    /// The same for an experiment that moves the bead: how far it goes from its reference is no failure.
+    /// The same for an experiment that moves the bead: a large distance from the reference is then not a failure.
     #[must_use]
     pub fn moving_the_bead(self) -> Self {
         Self {
@@ -376,7 +374,7 @@ where
     /// Starts the loop on its threads.
     ///
     /// # Errors
-    /// No thread could be had; the board is parked.
+    /// No thread could be started; the board is parked.
     pub fn start(self) -> Result<Running<S>, Failure> {
         let operator = Arc::clone(&self.rig.operator);
         let thread = std::thread::Builder::new()
@@ -386,7 +384,7 @@ where
         Ok(Running::new(operator, thread))
     }
 
-    /// The loop, on threads that it makes for itself; the calling one waits for them.
+    /// Runs the loop on its own threads; the calling thread waits for them.
     fn run(self) -> Result<Finished<S>, Failure> {
         // Dropped in reverse order if the driver panics: the rig is parked before the signals stop reaching it.
         let Self {
@@ -420,7 +418,7 @@ where
                 core, source, actuator, sink, statistics, end, &threads, &operator,
             )
         };
-        // Freezes and parks once more where the driver could not.
+        // Freezes and parks again if the driver could not.
         if finished.as_ref().is_ok_and(|run| run.io_error.is_none()) {
             rig.devices.armed = false;
         }
@@ -464,10 +462,10 @@ pub struct Finished<S> {
     pub learned: Vec<Option<LearnedTable>>,
     /// How the recording went.
     pub recorder: RecorderReport,
-    /// Gain over the model's as the arming pulse showed it, where it was accepted and is nevertheless not the model's.
+    /// Gain over the model's from the arming pulse, if it was accepted but differs from the model's.
     pub odd_gain: Option<f64>,
     /// Failure of a thread other than control, if any.
     pub trouble: Option<RunError>,
-    /// The sink, with all that it was given.
+    /// The sink, with all that it received.
     pub sink: S,
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// A loop that runs, and ends in an `F`. Dropped, it is told to park, and waited for.
+/// A running loop that ends in an `F`. On drop it asks the loop to park and waits for it.
 pub struct Running<F> {
     operator: Arc<Operator>,
     thread: Option<JoinHandle<Result<F, Failure>>>,
@@ -21,7 +21,7 @@ impl<F> Running<F> {
         }
     }
 
-    /// Who may ask for freeze, park, pause.
+    /// The handle that requests freeze, park and pause.
     pub fn operator(&self) -> &Arc<Operator> {
         &self.operator
     }
@@ -39,7 +39,7 @@ impl<F> Running<F> {
         self.wait_with(Duration::from_secs(3600), || {})
     }
 
-    /// Waits for its end, and does something now and then meanwhile.
+    /// Waits for its end, and calls a function from time to time.
     ///
     /// # Errors
     /// The run could not be carried through; the PZT is parked.
@@ -53,7 +53,7 @@ impl<F> Running<F> {
         let mut told = false;
         while !thread.is_finished() {
             std::thread::sleep(LOOK_EVERY);
-            // A recorder that hangs holds the end of the run: it is named now.
+            // A recorder that hangs delays the end of the run: name it now.
             if let Some(fault) = self.operator.recorder_fault().filter(|_| !told) {
                 tracing::error!("{}", fault.sentence());
                 told = true;
@@ -68,7 +68,7 @@ impl<F> Running<F> {
     }
 }
 
-/// Parks when whoever waits for a run panics.
+/// Parks if the thread that waits for a run panics.
 struct ParkOnPanic<'a>(&'a Operator);
 
 impl Drop for ParkOnPanic<'_> {

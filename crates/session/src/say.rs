@@ -1,6 +1,6 @@
-//! Words to the person at the terminal that nothing waits for: a signal must stop a rig whether or not anybody reads about it.
+//! Messages to the terminal that never block: a signal must stop a rig even if nobody reads the terminal.
 
-/// Says a line on standard error, without ever waiting for it.
+/// Writes a line to standard error without waiting for it.
 pub fn say(line: impl AsRef<str>) {
     cellpos_live::terminal::stderr().say(line.as_ref());
 }

@@ -1,5 +1,4 @@
-//! Everything that determines the commands of a run, in a form that is written into the run folder and read back by a
-//! replay.
+//! Everything that determines the commands of a run. The run folder holds it, and a replay reads it back.
 
 use crate::Failure;
 use crate::cyclic::LearnSpec;
@@ -173,7 +172,7 @@ impl ReferenceSpec {
 /// A loop before it is built.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setup {
-    /// The plant that the controller believes in.
+    /// The plant that the controller assumes.
     pub model: Model,
     /// Controller, estimator and limits.
     pub controller: ControllerFile,
@@ -187,7 +186,7 @@ pub struct Setup {
 pub struct SetupConfig {
     /// PZT displacement at the start, um.
     pub displacement_um: f64,
-    /// First belief of neutral, um.
+    /// First estimate of neutral, um.
     pub neutral_um: f64,
     /// The bead's reference.
     pub reference: ReferenceSpec,
@@ -195,7 +194,7 @@ pub struct SetupConfig {
     pub timing: Timing,
     /// The check before the loop is closed.
     pub arming: ArmingConfig,
-    /// The slow partner of the PZT, where there is one.
+    /// The slow partner of the PZT, if there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub partner: Option<PartnerConfig>,
     /// Learning over cycles, if it is on.
@@ -241,7 +240,7 @@ impl Setup {
     /// Builds the loop with the reference of the set-up, and the learning on it.
     ///
     /// # Errors
-    /// A value that cannot be, named.
+    /// An invalid value; the error names it.
     pub fn core(&self) -> Result<Core<AnyReference>, Failure> {
         let core = self.core_with(self.law()?)?;
         let sample_s = self.config.timing.period_us * 1e-6;
@@ -273,7 +272,7 @@ impl Setup {
     /// learning.
     ///
     /// # Errors
-    /// A value that cannot be, named.
+    /// An invalid value; the error names it.
     pub fn core_with(&self, law: Controller) -> Result<Core<AnyReference>, Failure> {
         self.joined(law, self.config.reference.generator(&self.config.timing)?)
     }
@@ -281,13 +280,13 @@ impl Setup {
     /// Builds the loop with another reference generator.
     ///
     /// # Errors
-    /// A value that cannot be, named.
+    /// An invalid value; the error names it.
     pub fn core_following<R: ReferenceGenerator>(&self, reference: R) -> Result<Core<R>, Failure> {
         self.joined(self.law()?, reference)
     }
 
-    /// What the linear model of this loop predicts for the measured error while it holds, at each frequency, Hz. `None`: nothing
-    /// diffuses, the law has no linear form, or the model calls the loop unstable.
+    /// The spectrum that the loop's linear model predicts for the measured error of a hold, at each frequency, Hz. `None`: nothing
+    /// diffuses, the law has no linear form, or the loop is unstable on the model.
     pub fn predicted_density(&self, diffusion_um2_per_s: f64, hz: &[f64]) -> Option<Predicted> {
         let sample_s = self.config.timing.period_us * 1e-6;
         let delay_s = self.controller.delay_ms * 1e-3;
@@ -341,14 +340,14 @@ impl Setup {
     }
 }
 
-/// The loop delay of a rig, s: its camera path (`camera_delay_ms`: from the middle of an exposure to the tick that uses it), the way of
-/// a command to the bead as it was measured with the model, and half a period of hold. The one definition: controllers are
-/// designed for it.
+/// The loop delay of a rig, s. It is the sum of the camera path (`camera_delay_ms`: from the middle of an exposure to the tick that uses
+/// it), the path of a command to the bead, measured with the model, and half a period of hold. This is the only definition; controllers
+/// are designed for it.
 pub fn loop_delay_s(model: &Model, timing: &Timing) -> f64 {
     timing.camera_delay_ms * 1e-3 + command_delay_s(model) + 0.5e-6 * timing.period_us
 }
 
-/// From a command to what it does to the bead, s: line, board and amplifier. 0 where the model does not tell.
+/// Delay from a command to its effect on the bead, s: line, board and amplifier. 0 if the model does not state it.
 fn command_delay_s(model: &Model) -> f64 {
     let beyond_s = |delay_s: f64| Some(delay_s - model.frame_age_s?);
     model
@@ -358,12 +357,12 @@ fn command_delay_s(model: &Model) -> f64 {
         .max(0.0)
 }
 
-/// Difference of a delay that gives a warning, as a fraction of the period: half a period costs a controller some degrees of margin.
-/// One figure for all who compare delays, so that none takes back what another advises.
+/// Difference of delays that gives a warning, as a fraction of the period: half a period costs a controller some degrees of margin. All
+/// comparisons of delays use this figure, so that no advice contradicts another.
 const WORTH_SAYING: f64 = 0.3;
 
-/// Remedy if the age of frames at their ticks differs from the rig file. `found_ms` is by the stamps of the frames, from the
-/// middle of their exposure to the tick that used them: the one measurement behind this key, whoever makes it.
+/// Remedy if the age of frames at their ticks differs from the rig file. `found_ms` comes from the frames' stamps: from the middle of an
+/// exposure to the tick that used it. Every measurement of this key has this definition.
 pub fn camera_delay_advice(found_ms: f64, timing: &Timing) -> Option<String> {
     let configured_ms = timing.camera_delay_ms;
     ((found_ms - configured_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
@@ -374,8 +373,8 @@ pub fn camera_delay_advice(found_ms: f64, timing: &Timing) -> Option<String> {
     })
 }
 
-/// What is wrong when a model was measured with frames of another age than the rig file states, or, where the model does not tell that
-/// age, with another delay.
+/// The warning if a model was measured with frames of another age than the rig file states or, if the model does not state that age, with
+/// another delay.
 pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
     let (measured_ms, rig_ms) = (model.camera_delay_s? * 1e3, timing.camera_delay_ms);
     if let Some(age_s) = model.frame_age_s {
@@ -388,8 +387,8 @@ pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
     })
 }
 
-/// The law of a run that names none. It holds 15 % closer than PI, follows a script's fast motions, and keeps the bead through
-/// steps of the flow as well as MPC, in less time a tick.
+/// The default law of a run. It holds 15 % closer than PI and follows a script's fast motions. It keeps the bead through steps of the
+/// flow as well as MPC, with less time per tick.
 pub const DEFAULT_LAW: &str = "lqg";
 
 /// A controller by name (`pi`, `lead`: gains found for the model and the delay; `lqg`, `mpc`: the default weights) or

@@ -1,4 +1,4 @@
-//! What the signals of the operating system do, in one place for every command that may hold a rig.
+//! The effects of operating-system signals, in one place for every command that may hold a rig.
 //!
 //! | signal | a rig is held | no rig is held |
 //! |---|---|---|
@@ -10,8 +10,8 @@
 //! | PIPE | nothing: the write fails, the run goes on | the write fails |
 //! | HUP, inherited ignored (`nohup`) | nothing | nothing |
 //!
-//! A session registers before it arms the board and leaves after the board is parked. In between no signal can end the program
-//! with the board armed. Once a stop was asked for, nothing is armed any more.
+//! A session registers before it arms the board and leaves after the board is parked. In between no signal can end the program with the
+//! board armed. After a stop request nothing is armed any more.
 
 use crate::say::say;
 use cellpos_runtime::Request;
@@ -24,13 +24,13 @@ use signal_hook::low_level::{emulate_default_handler, signal_name};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Who holds a rig, and whether a stop was asked for.
+/// The holders of a rig, and the stop request, if any.
 #[derive(Debug)]
 struct Desk {
     listening: bool,
     sessions: Vec<Arc<Operator>>,
     stopped_by: Option<i32>,
-    /// A measurement without a rig, which a stop ends early.
+    /// A measurement without a rig, which a stop request ends early.
     measuring: Option<Arc<AtomicBool>>,
 }
 
@@ -45,7 +45,7 @@ fn desk() -> MutexGuard<'static, Desk> {
     DESK.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A place at the desk: while it is held, signals go to the session and do not end the program.
+/// A registration: while it is held, signals go to the session and do not end the program.
 #[derive(Debug)]
 pub struct Place(Arc<Operator>);
 
@@ -57,15 +57,15 @@ impl Drop for Place {
     }
 }
 
-/// A stop was asked for before the board was armed.
+/// A stop was requested before the board was armed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("stopped by {}: the board was not armed", name(*.0))]
 pub struct Stopped(i32);
 
-/// Takes a place for a session.
+/// Registers a session.
 ///
 /// # Errors
-/// A stop was asked for already: nothing is to be armed any more.
+/// A stop was requested already, so nothing may be armed any more.
 pub fn hold(operator: &Arc<Operator>) -> Result<Place, Stopped> {
     let mut desk = desk();
     if let Some(signal) = desk.stopped_by {
@@ -83,7 +83,7 @@ pub fn ends_measuring() -> Arc<AtomicBool> {
     flag
 }
 
-/// The signal that asked for a stop while a rig was held, by name; `None`: none did.
+/// Name of the signal that requested a stop while a rig was held, if any.
 pub fn stopped_by() -> Option<&'static str> {
     desk().stopped_by.map(name)
 }
@@ -141,7 +141,7 @@ fn act(signal: i32) {
         }
         if !matches!(signal, SIGUSR1 | SIGUSR2) {
             cellpos_live::terminal::give_back();
-            // The desk stays closed meanwhile: nobody arms a board while the program ends.
+            // Registration remains closed meanwhile: nobody can arm a board while the program ends.
             let _ = emulate_default_handler(signal);
         }
         return;
@@ -177,7 +177,7 @@ fn act(signal: i32) {
 
 /// What a key does: p or space pauses and continues, s skips to the next step, q stops.
 pub fn press(key: u8, operator: &Operator) {
-    // Whichever of two requests holds; neither once a stop has been asked for.
+    // Switches between two requests; has no effect after a stop request.
     let toggle = |from, to, back| {
         let _ = operator.change(Request::None, to) || operator.change(from, back);
     };

@@ -6,9 +6,9 @@ use miette::{LabeledSpan, NamedSource};
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
-/// Reads a file into a type; unknown keys are the type's to refuse.
+/// Reads a file into a type; the type itself refuses unknown keys.
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
-    /// No configuration comes near it.
+    /// Far beyond any configuration.
     const MOST_BYTES: u64 = 1 << 24;
     let text = cellpos_table::read_text(path, MOST_BYTES).map_err(|error| {
         Failure::bad_input(

@@ -1,4 +1,4 @@
-//! What is noted of a run on its way to the sink.
+//! Collects the clues of a run's end on the way to the sink.
 
 use crate::ended::Clues;
 use crate::words::is_odd;
@@ -6,7 +6,7 @@ use crate::{say, words};
 use cellpos_runtime::life::EventKind;
 use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 
-/// Hands everything on to a sink, and keeps what says why a run ended.
+/// Passes everything on to a sink, and keeps the events that explain why a run ended.
 pub(crate) struct Witness<S> {
     pub(crate) sink: S,
     pub(crate) clues: Clues,
@@ -27,7 +27,7 @@ impl<S: RunSink> RunSink for Witness<S> {
 
     fn event(&mut self, event: &Event) {
         self.clues.note(event);
-        // Worth knowing while the bead is still held, and not only when the run is over.
+        // Report it while the bead is still held, not only after the run.
         let told = match event.kind {
             EventKind::ArmingPassed { gain_ratio, ci95 } => is_odd(gain_ratio, ci95),
             EventKind::DiskSlowStarted { .. } => true,

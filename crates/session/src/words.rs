@@ -3,14 +3,14 @@
 use crate::adapt;
 use cellpos_runtime::life::{EventKind, FreezeReason, Refusal, SafeReason};
 
-/// How much an event matters to whoever looks on.
+/// Importance of an event for the operator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Level {
-    /// The run goes as it should.
+    /// The run is as expected.
     Info,
-    /// Something was not as it should be, and the run got over it.
+    /// Something went wrong, but the run recovered.
     Warning,
-    /// The run cannot go on as it was to.
+    /// The run cannot continue as planned.
     Fault,
 }
 
@@ -25,7 +25,7 @@ impl Level {
     }
 }
 
-/// A sentence of the program about what is followed: a cell, if it is one, where the sentence has a bead.
+/// A sentence about the tracked object: replaces "bead" by "cell" if it is a cell.
 pub fn of_what_is_followed(sentence: &str, cell: bool) -> String {
     if !cell {
         return sentence.to_owned();
@@ -97,13 +97,13 @@ fn refusal(reason: Refusal) -> &'static str {
     }
 }
 
-/// Whether a gain over the model's differs from 1 by more than a rig does from day to day, beyond its 95 % interval.
+/// Whether a gain over the model's differs from 1, beyond its 95 % interval, by more than a rig varies from day to day.
 pub(crate) fn is_odd(ratio: f64, ci95: f64) -> bool {
     const USUAL: f64 = 1.25;
     ratio - ci95 > USUAL || ratio + ci95 < 1.0 / USUAL
 }
 
-/// An event in a sentence, and how much it matters.
+/// An event in a sentence, and its importance.
 pub fn sentence(kind: &EventKind) -> (Level, String) {
     (level(kind), text(kind))
 }
@@ -243,7 +243,7 @@ fn paused(count: u32) -> String {
     format!("{count} {pauses} of the loop: the bead seemed to move against the commands.")
 }
 
-/// What the slow actuator does.
+/// The state of the slow actuator in words.
 fn partner(kind: &EventKind) -> String {
     match *kind {
         EventKind::PartnerBack { lasted_ms } => ended("The slow actuator obeys again", lasted_ms),

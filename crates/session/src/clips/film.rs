@@ -1,4 +1,4 @@
-//! Clips read back: which there are in a run folder, and their frames in 8 bits.
+//! Reads clips back: their names in a run folder, and their frames in 8 bits.
 
 use super::CLIPS;
 use cellpos_live::{ClipLine, FilmFrame, film_bytes};
@@ -30,7 +30,7 @@ impl Film {
     }
 }
 
-/// The clips of a run folder that are whole, by their names.
+/// Names of the complete clips of a run folder.
 pub fn list(run: &Path) -> Vec<ClipLine> {
     let Ok(entries) = std::fs::read_dir(run.join(CLIPS)) else {
         return vec![];
@@ -56,7 +56,7 @@ pub fn list(run: &Path) -> Vec<ClipLine> {
     found
 }
 
-/// Whether a name can be that of a clip: it never leads out of the folder.
+/// Whether a name can be that of a clip, which never leads out of the folder.
 fn is_a_name(name: &str) -> bool {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_');
     !name.is_empty() && name.len() < 200 && !name.starts_with('.') && name.chars().all(allowed)
@@ -81,7 +81,7 @@ fn times(run: &Path, name: &str) -> io::Result<Vec<(f64, [f32; 2])>> {
 /// A clip of a run folder, at most `most` of its frames.
 ///
 /// # Errors
-/// No clip of that name, or another file.
+/// No clip has that name, or the file is something else.
 pub fn read(run: &Path, name: &str, most: usize) -> io::Result<Film> {
     if !is_a_name(name) {
         return Err(io::ErrorKind::NotFound.into());
@@ -105,7 +105,7 @@ pub fn read_at(run: &Path, name: &str, time_s: f64) -> io::Result<Film> {
     frames(run, name, &times, vec![nearest])
 }
 
-/// The frames of these numbers, in rising order.
+/// The frames with these numbers, in rising order.
 fn frames(
     run: &Path,
     name: &str,

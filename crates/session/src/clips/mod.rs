@@ -1,12 +1,12 @@
-//! Clips: the frames around what happened, and at chosen phases of chosen cycles, kept with the run.
+//! Clips: the frames around events, and at chosen phases of chosen cycles, kept with the run.
 //!
 //! ```text
 //! camera thread -> full buffers -> clip thread (ring of the last seconds -> TIFF) -> empty buffers -> camera thread
 //! recorder thread -> what happened (a channel) --^
 //! ```
 //!
-//! The camera thread copies each frame into a buffer that exists already; without an empty one the frame is dropped and counted.
-//! Everything slow happens on the clip thread.
+//! The camera thread copies each frame into an existing buffer. If none is empty, it drops and counts the frame. The clip thread
+//! does everything slow.
 
 mod film;
 mod moment;
@@ -35,7 +35,7 @@ use std::time::Duration;
 
 /// Memory of the buffers at most, bytes.
 const MOST_MEMORY: usize = 256 << 20;
-/// From a frame until the clip thread hears of what happened in it, s: the recorder looks some ten times a second.
+/// Longest time from a frame until the clip thread hears of its events, s: the recorder looks some ten times a second.
 const HEARD_AFTER_S: f64 = 0.7;
 /// Name of the folder of clips in a run folder.
 pub const CLIPS: &str = "clips";
@@ -43,9 +43,9 @@ pub const CLIPS: &str = "clips";
 /// How much is kept.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClipConfig {
-    /// Time before what happened, s.
+    /// Time before the event, s.
     pub before_s: f64,
-    /// Time behind it, s.
+    /// Time after the event, s.
     pub after_s: f64,
     /// All clips of a run together, bytes at most.
     pub most_bytes: u64,
@@ -61,12 +61,12 @@ impl Default for ClipConfig {
     }
 }
 
-/// What became of the clips of a run.
+/// The outcome of the clips of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ClipReport {
     /// Files written, in the run folder's `clips`.
     pub written: Vec<String>,
-    /// Moments for which the bound on disk space left no room.
+    /// Moments without a clip, because the limit of disk space was reached.
     pub no_room: u64,
     /// Frames that found no empty buffer.
     pub frames_left_out: u64,
@@ -84,10 +84,11 @@ pub struct Clips {
 }
 
 impl Clips {
-    /// Clips into `folder/clips`, and what shows them the frames of a camera of `width_px` x `height_px` at `rate_hz`.
+    /// Writes clips into `folder/clips`; also returns the watch that shows them the frames of a camera of `width_px` x
+    /// `height_px` at `rate_hz`.
     ///
     /// # Errors
-    /// The thread could not be had.
+    /// The thread could not be started.
     pub fn open(
         folder: &Path,
         config: ClipConfig,
@@ -102,7 +103,7 @@ impl Clips {
         let (full, full_out) = RingBuffer::new(count);
         let (mut empty, empty_out) = RingBuffer::new(count);
         for _ in 0..count {
-            // As many as the ring has room for.
+            // As many as fit into the ring.
             let _ = empty.push(Shot::with_room(pixels));
         }
         let left_out = Arc::new(AtomicU64::new(0));
@@ -142,7 +143,7 @@ impl Clips {
         Ok((clips, Box::new(taker)))
     }
 
-    /// The next clip that was written since.
+    /// The next newly written clip.
     pub fn next_kept(&self) -> Option<ClipLine> {
         self.kept.try_recv().ok()
     }
@@ -184,7 +185,7 @@ impl FrameWatch for Taker {
             return;
         };
         fill(seen, self.crop, &mut shot);
-        // As many buffers exist as the ring has room for.
+        // There are as many buffers as fit into the ring.
         let _ = self.full.push(shot);
     }
 }
@@ -212,7 +213,7 @@ fn fill(seen: &SeenFrame<'_>, most: (usize, usize), shot: &mut Shot) {
     shot.centre_px = centre.unwrap_or((f64::NAN, f64::NAN));
 }
 
-/// On the clip thread: keeps the last seconds, and writes.
+/// On the clip thread: keeps the last seconds, and writes the clips.
 struct Keeper {
     ring: Ring,
     full: Consumer<Shot>,
@@ -237,7 +238,7 @@ impl Keeper {
             while let Ok(moment) = self.heard.try_recv() {
                 self.ring.expect(moment);
             }
-            // At the end of the run what has not come will not come.
+            // At the end of the run no further frame comes.
             while let Some(moment) = self.ring.next_ready(last) {
                 self.write(&moment);
             }

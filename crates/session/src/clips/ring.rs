@@ -1,4 +1,4 @@
-//! The frames of the last seconds, and the moments that wait for theirs.
+//! The frames of the last seconds, and the moments that wait for their last frames.
 
 use super::moment::Moment;
 use std::collections::VecDeque;
@@ -16,7 +16,7 @@ pub(super) struct Shot {
     pub(super) height: usize,
     /// Its place in the camera's picture: column, row.
     pub(super) origin_px: (usize, usize),
-    /// Where the bead or cell is in it; NaN: it was not seen.
+    /// Position of the bead or cell in it; NaN if it was not seen.
     pub(super) centre_px: (f64, f64),
 }
 
@@ -34,11 +34,11 @@ impl Shot {
     }
 }
 
-/// Frames in the order of their exposure, and moments that are not over.
+/// Frames in the order of their exposure, and moments that still wait for frames.
 #[derive(Debug)]
 pub(super) struct Ring {
     shots: VecDeque<Shot>,
-    /// As many as leave buffers for the frames that come meanwhile.
+    /// Most frames to keep, so that buffers remain for the frames that come meanwhile.
     most: usize,
     before_ns: i64,
     after_ns: i64,
@@ -56,7 +56,7 @@ impl Ring {
         }
     }
 
-    /// Takes a frame; gives the oldest back where there are too many.
+    /// Takes a frame; returns the oldest if there are too many.
     pub(super) fn push(&mut self, shot: Shot) -> Option<Shot> {
         self.shots.push_back(shot);
         if self.shots.len() > self.most {
@@ -78,7 +78,7 @@ impl Ring {
         known.map_or(0, |shot| shot.stamp_ns - in_run_ns)
     }
 
-    /// The next moment whose last frame is here, or all that wait if none will come any more.
+    /// The next moment whose last frame is here; once no frame will come any more, each waiting moment.
     pub(super) fn next_ready(&mut self, last: bool) -> Option<Moment> {
         let moment = self.waiting.front()?;
         let newest_ns = self.shots.back().map(|shot| shot.stamp_ns);

@@ -1,4 +1,4 @@
-//! When a clip is kept: around what happened, and where the schedule says.
+//! Decides when to keep a clip: around events, and at the times of the schedule.
 
 use super::Clips;
 use super::moment::Moment;
@@ -9,10 +9,10 @@ use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
 /// Moments of a script's plan, in their order: time in the plan, s, and name.
 pub type Schedule = Vec<(f64, String)>;
 
-/// Least time between two clips of what happened, s: a fault that comes and goes is seen in the first.
+/// Least time between two clips of events, s: the first clip shows an intermittent fault.
 const APART_S: f64 = 10.0;
 
-/// A sink that keeps clips of what passes through it.
+/// A sink that keeps clips of the run that passes through it.
 pub struct Clipped<S> {
     sink: S,
     clips: Option<Clips>,
@@ -24,7 +24,7 @@ pub struct Clipped<S> {
 }
 
 impl<S> Clipped<S> {
-    /// A sink with clips, or the bare sink without any. `events`: whether what happens is kept.
+    /// A sink with clips, or the bare sink without them. `events`: whether events are kept.
     pub fn new(sink: S, clips: Option<Clips>, schedule: Schedule, events: bool) -> Self {
         Self {
             sink,
@@ -44,7 +44,7 @@ impl<S> Clipped<S> {
 
     fn keep(&self, record: &TickRecord, name: String) {
         if let Some(moments) = self.clips.as_ref().and_then(|clips| clips.moments.as_ref()) {
-            // The thread is gone only when it failed, which it says at the end.
+            // The thread is gone only if it failed, which it reports at the end.
             let _ = moments.send(Moment {
                 frame: (record.frame_id, record.mid_exposure_ns),
                 at_ns: record.time_ns,

@@ -47,7 +47,7 @@ pub(super) fn write(
             number_or_nothing(shot.centre_px.1),
         );
     }
-    // Whoever finds the table finds both whole.
+    // A reader that finds the table finds both files complete.
     let unfinished = path("csv.part");
     std::fs::write(&unfinished, times)?;
     std::fs::rename(unfinished, path("csv"))

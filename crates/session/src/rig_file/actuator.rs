@@ -1,4 +1,4 @@
-//! What moves the bead, the table `[actuator]`.
+//! The table `[actuator]`: the device that moves the bead.
 
 use cellpos_plant::Model;
 use cellpos_plant::effects::{bubble, driver_lag};
@@ -12,8 +12,8 @@ use std::path::PathBuf;
 pub enum ActuatorConfig {
     /// The firmware library in this process.
     Emulated {},
-    /// A pressure controller in the PZT's place, in this process: slow commands, a regulator, a tube that stretches. Its unit is um
-    /// of PZT displacement.
+    /// A pressure controller instead of the PZT, in this process: slow commands, a regulator, a tube that stretches. Its unit is um of
+    /// PZT displacement.
     EmulatedPressure {
         /// Between two commands, ms: the period of the loop.
         #[serde(default = "command_period_ms")]
@@ -27,16 +27,16 @@ pub enum ActuatorConfig {
     },
     /// A board behind a serial port.
     Serial {
-        /// Device, for example /dev/ttyUSB0; a relative path is meant from the folder of the file.
+        /// Device, for example /dev/ttyUSB0; a relative path starts at the folder of the file.
         port: String,
         /// Baud rate; a pseudo-terminal takes any.
         #[serde(default = "baud")]
         baud: u32,
-        /// Without a fresh command for this long the board goes to the zero-flow displacement and holds it, ms; left
-        /// out: the board's own.
+        /// After this time without a new command the board moves to the zero-flow displacement and holds it, ms; left out: the board's
+        /// own.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         watchdog_ms: Option<u16>,
-        /// When it has held for this long it parks, ms; left out: the board's own.
+        /// After holding for this time it parks, ms; left out: the board's own.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         hold_watchdog_ms: Option<u16>,
     },
@@ -53,10 +53,10 @@ pub enum ActuatorConfig {
         /// Lag of the tube that stretches behind it, ms; 0: none, or in the model.
         #[serde(default)]
         compliance_ms: f64,
-        /// Without a fresh command for this long it goes to the zero-flow displacement and holds it, ms; left out: its own.
+        /// After this time without a new command it moves to the zero-flow displacement and holds it, ms; left out: its own.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         watchdog_ms: Option<u16>,
-        /// When it has held for this long it parks, ms; left out: its own.
+        /// After holding for this time it parks, ms; left out: its own.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         hold_watchdog_ms: Option<u16>,
     },
@@ -68,7 +68,7 @@ impl ActuatorConfig {
         matches!(self, Self::Emulated {} | Self::EmulatedPressure { .. })
     }
 
-    /// Time between two commands if it is slower than the board, ms.
+    /// Time between two commands, if the actuator is slower than the board, ms.
     pub fn period_ms(&self) -> Option<f64> {
         match self {
             Self::Program { period_ms, .. } | Self::EmulatedPressure { period_ms, .. } => {
@@ -95,8 +95,8 @@ impl ActuatorConfig {
         }
     }
 
-    /// The plant behind this actuator: with the lags of regulator and tube. Unless the model has effects for them, or was
-    /// measured with the actuator (then it states the delay of its camera path).
+    /// The plant behind this actuator. It adds the lags of regulator and tube, unless the model has effects for them or was measured with
+    /// the actuator (then it states the delay of its camera path).
     #[must_use]
     pub fn before(&self, mut model: Model) -> Model {
         if model.camera_delay_s.is_some() {
@@ -121,7 +121,7 @@ fn regulator_ms() -> f64 {
     50.0
 }
 
-/// What pressure controllers take, ms.
+/// Usual command periods of pressure controllers, ms.
 pub(super) fn command_period_ms() -> f64 {
     20.0
 }

@@ -1,4 +1,4 @@
-//! The devices that a rig file names, opened.
+//! Opens the devices that a rig file names.
 
 use super::{ActuatorConfig, CameraConfig, ClockKind, Frames, PartnerTable, RigFile};
 use crate::Failure;
@@ -28,11 +28,11 @@ pub struct Connected {
     flow: CommandedFlow,
 }
 
-/// Where a plant's gain from PZT displacement to bead velocity is read for the tracker's prediction.
+/// Frequency at which the tracker's prediction reads the plant's gain from PZT displacement to bead velocity.
 const FLOW_GAIN_AT: Hertz = Hertz(20.0);
 
 impl Connected {
-    /// Devices that were connected by somebody else.
+    /// Devices that other code connected.
     pub(crate) fn of(
         source: Box<dyn PositionSource>,
         actuator: Box<dyn Actuator>,
@@ -47,8 +47,8 @@ impl Connected {
         })
     }
 
-    /// Lets the tracker predict the bead with this plant's gain; until then it takes that of Eq. (6). The prediction
-    /// allows for a gain that is wrong by half.
+    /// Lets the tracker predict the bead with this plant's gain; before, it uses that of Eq. (6). The prediction
+    /// tolerates a gain that is wrong by half.
     pub fn expect(&self, model: &Model) {
         self.flow
             .set_gain_per_s(model.plant.velocity_gain_at(FLOW_GAIN_AT));
@@ -56,7 +56,7 @@ impl Connected {
 }
 
 impl RigFile {
-    /// A camera behind the tracker of this rig, with no command that it could know of.
+    /// A camera behind the tracker of this rig, which knows no command.
     ///
     /// # Errors
     /// Settings that cannot be used, or no calibration.
@@ -140,7 +140,7 @@ impl RigFile {
         let source: Box<dyn PositionSource> = match frames {
             Frames::Off => Box::new(emulated.positions()),
             Frames::On => {
-                // A calibration in the file, right or wrong, rehearses one of a real rig.
+                // A calibration in the file, right or wrong, is used as on a real rig.
                 let calibration = self.calibration.unwrap_or(emulated.calibration());
                 self.tracked(emulated.camera(), calibration, &clock, &flow)?
             }
@@ -272,12 +272,12 @@ impl RigFile {
         })
     }
 
-    /// The PZT with its slow partner. Where that is missing the PZT goes alone, and the user is warned.
+    /// The PZT with its slow partner. If the partner is missing, the PZT runs alone and the user gets a warning.
     fn paired(&self, fast: Box<dyn Actuator>, warnings: &mut Vec<String>) -> Box<dyn Actuator> {
         let Some(partner) = &self.partner else {
             return fast;
         };
-        // A table without a socket was refused when the file was read.
+        // The reader of the file refuses a table without a socket.
         let socket = partner.socket.clone().unwrap_or_default();
         let line = ProgramLine::open(&socket).map_err(|error| error.to_string());
         let slow = line.and_then(|line| {
@@ -310,7 +310,7 @@ impl RigFile {
     }
 }
 
-/// The flow of Eq. (6)'s plant, nothing commanded yet.
+/// The flow of Eq. (6)'s plant, before any command.
 fn nominal_flow() -> Result<CommandedFlow, Failure> {
     let nominal = Model::load("eq6").map_err(Failure::input)?;
     Ok(CommandedFlow::new(

@@ -1,4 +1,4 @@
-//! rig.toml: which camera, which board, their calibration and limits, and the times of the loop.
+//! rig.toml: camera and board, their calibration and limits, and the times of the loop.
 
 mod actuator;
 mod connect;
@@ -21,23 +21,23 @@ use cellpos_vision::{CellConfig, CellFinder, LocaliserConfig, TrackerConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// A rig.toml. Every table may be left out; the defaults are the emulated rig of the paper. Within a table the keys without a default,
-/// such as `kind` of a device or `pixel_um` of a calibration, must be there.
+/// A rig.toml. Every table may be left out; the defaults are the emulated rig of the paper. Within a table, keys without a default, such
+/// as `kind` of a device or `pixel_um` of a calibration, are required.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RigFile {
-    /// First belief of the PZT displacement at which the bead is at rest, um; the loop finds the rest.
+    /// First estimate of the PZT displacement at which the bead is at rest, um; the loop then finds it.
     pub first_neutral_um: f64,
-    /// Of several beads in view, the one nearest to this position at the start is followed, um; left out: the most
-    /// prominent. The option `--near` of `track` and `run` goes before.
+    /// Of several beads in view, the one nearest to this position at the start is followed, um; left out: the most prominent. The option
+    /// `--near` of `track` and `run` overrides it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub near_um: Option<f64>,
-    /// What is in the channel; a script's own goes before.
+    /// Contents of the channel; a script's own entry overrides it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sample: Option<Sample>,
     /// The PZT board.
     pub actuator: ActuatorConfig,
-    /// A slow actuator alongside it; left out: none.
+    /// A slow actuator alongside the PZT; left out: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub partner: Option<PartnerTable>,
     /// The camera.
@@ -45,13 +45,13 @@ pub struct RigFile {
     /// From pixels to micrometres; left out for the emulated camera: its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<Calibration>,
-    /// A calibration file instead of `[calibration]`, with date and uncertainty; from the folder of rig.toml.
+    /// A calibration file instead of `[calibration]`, with date and uncertainty; its path starts at the folder of rig.toml.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration_file: Option<PathBuf>,
     /// Localisation; left out: a ring profile for the bead of `[emulator]`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision: Option<LocaliserConfig>,
-    /// A cell is followed instead of a bead; an emulated rig with `[emulator.cell]` needs no such table.
+    /// Tracks a cell instead of a bead; an emulated rig with `[emulator.cell]` needs no such table.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cell: Option<CellInView>,
     /// Tracking; left out: for a 1 um bead in water.
@@ -69,12 +69,12 @@ pub struct RigFile {
     pub emulator: WorldConfig,
 }
 
-/// How a cell is seen, the table `[cell]`.
+/// The table `[cell]`: how vision finds a cell.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CellInView {
-    /// Recording of the empty channel, as `cellpos background` writes it; from the folder of rig.toml. The emulated camera
-    /// brings its own.
+    /// Recording of the empty channel, as written by `cellpos background`; its path starts at the folder of rig.toml. The emulated camera
+    /// has its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<PathBuf>,
     /// What counts as a cell.
@@ -102,24 +102,24 @@ pub enum CameraConfig {
         /// Frame rate, Hz.
         #[serde(default = "rate_hz")]
         rate_hz: f64,
-        /// Part of the sensor read out; left out: as the camera is set.
+        /// Part of the sensor that is read out; left out: the camera's own setting.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         region: Option<Region>,
-        /// Exposure, us; left out: as the camera is set.
+        /// Exposure, us; left out: the camera's own setting.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         exposure_us: Option<f64>,
         /// 8 or 16 bits per pixel.
         #[serde(default = "bits")]
         bits: u16,
-        /// From the middle of an exposure to its fastest arrival, ms: its time stamps are brought to this machine's clock by
-        /// it. The LED test measures it; left out: [`CameraConfig::LATENCY_MS`].
+        /// From the middle of an exposure to its fastest arrival, ms. It converts the camera's time stamps to this machine's clock. The
+        /// LED test measures it; left out: [`CameraConfig::LATENCY_MS`].
         #[serde(default, skip_serializing_if = "Option::is_none")]
         latency_ms: Option<f64>,
     },
 }
 
 impl CameraConfig {
-    /// What half an exposure, the way out of a sensor at 1 kHz and the network take together, ms: a guess to begin with.
+    /// First guess for half an exposure, the readout of a sensor at 1 kHz and the network together, ms.
     pub const LATENCY_MS: f64 = 1.5;
 }
 
@@ -187,7 +187,7 @@ impl RigFile {
         };
         let mut file: Self = quantities::read(path)?;
         file.validate(path)?;
-        // Paths in the file are meant from the file's own folder.
+        // Paths in the file start at the file's own folder.
         let folder = path.parent().unwrap_or(Path::new(""));
         if let Some(calibration) = &mut file.calibration_file {
             *calibration = folder.join(&*calibration);
@@ -231,7 +231,7 @@ impl RigFile {
         Ok(file)
     }
 
-    /// Runs the loop at the period of an actuator that is slower than the camera. The arming pulse keeps its time as far as the
+    /// Runs the loop at the period of an actuator that is slower than the camera. The arming pulse keeps its duration as far as the
     /// period allows.
     fn keep_the_pace_of(&mut self, period_us: f64) {
         let own = Self::default();
@@ -351,7 +351,7 @@ impl RigFile {
     /// Overrides seed and imperfections of the emulated rig; None leaves them.
     ///
     /// # Errors
-    /// The rig is not emulated, and something is said of its imperfections.
+    /// The rig is not emulated, and the call sets its imperfections.
     pub fn emulate_as(&mut self, seed: Option<u64>, ideal: Option<bool>) -> Result<(), Failure> {
         if let Some(seed) = seed {
             self.emulator.seed = seed;
@@ -371,7 +371,7 @@ impl RigFile {
         self.actuator.is_emulated() && self.camera == CameraConfig::Emulated {}
     }
 
-    /// Whether a cell is followed, so that its length and area are measured.
+    /// Whether the rig tracks a cell, so that its length and area are measured.
     pub fn follows_a_cell(&self) -> bool {
         match self.camera {
             CameraConfig::Emulated {} => self.emulator.cell.is_some(),
@@ -379,7 +379,7 @@ impl RigFile {
         }
     }
 
-    /// The file with the empty channel, if cells are seen against one.
+    /// The file with the empty channel, if cells are found against one.
     pub fn background(&self) -> Option<&Path> {
         match self.camera {
             CameraConfig::Emulated {} => None,
@@ -387,7 +387,7 @@ impl RigFile {
         }
     }
 
-    /// Command watchdog and hold watchdog asked of the board, ms; `None` leaves the board's own.
+    /// Command watchdog and hold watchdog requested from the board, ms; `None` leaves the board's own.
     pub fn watchdogs_ms(&self) -> [Option<u16>; 2] {
         match self.actuator {
             ActuatorConfig::Serial {
@@ -401,7 +401,7 @@ impl RigFile {
                 ..
             } => [watchdog_ms, hold_watchdog_ms],
             ActuatorConfig::Emulated {} => [None, None],
-            // Five periods, as a program's: the board's own 20 ms would pass between two commands.
+            // Five periods, as for a program: the board's own 20 ms would expire between two commands.
             ActuatorConfig::EmulatedPressure { period_ms, .. } => {
                 [Some((5.0 * period_ms).round() as u16), None]
             }

@@ -1,4 +1,4 @@
-//! A slow actuator alongside the PZT, the table `[partner]`.
+//! The table `[partner]`: a slow actuator alongside the PZT.
 
 use super::actuator::command_period_ms;
 use cellpos_control::{BuildError, Limits, Partner, PartnerConfig};
@@ -17,8 +17,8 @@ pub enum PartnerKind {
     Program,
 }
 
-/// The slow partner of the PZT: it takes up what lasts, and returns the PZT to the middle of its stroke. Lengths are in um on its
-/// own scale unless stated otherwise.
+/// The slow partner of the PZT: it takes over lasting displacement, and so returns the PZT to the middle of its stroke. Lengths
+/// are in um on its own scale unless stated otherwise.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartnerTable {
@@ -57,7 +57,7 @@ pub struct PartnerTable {
     /// PZT displacement to which the PZT is returned, um; left out: the middle of `[limits]`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mid_um: Option<f64>,
-    /// Silence after which it holds where it is, ms; left out: five periods.
+    /// Silence after which it holds its position, ms; left out: five periods.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub watchdog_ms: Option<u16>,
     /// Time that it then holds before it parks, ms; left out: its own.

@@ -8,14 +8,14 @@ use std::path::Path;
 /// Opens a port.
 ///
 /// # Errors
-/// It cannot be opened: who has it, or what is missing.
+/// The port cannot be opened; the error names the program that has it, or what is missing.
 pub(super) fn open(port: &str, baud: u32) -> Result<SerialLine, Failure> {
     SerialLine::open(port, baud).map_err(|error| cannot_open(port, &error))
 }
 
 fn cannot_open(port: &str, error: &Error) -> Failure {
     match error.kind() {
-        // The first answers a lock that is held, the second TIOCEXCL.
+        // The first is the error of a held lock, the second that of TIOCEXCL.
         ErrorKind::WouldBlock | ErrorKind::ResourceBusy => Failure::bad_input(
             format!("[actuator] port = \"{port}\": {} has it open", holder(port)),
             "end that program, or wait until it has parked the PZT",
@@ -31,8 +31,8 @@ fn cannot_open(port: &str, error: &Error) -> Failure {
     }
 }
 
-/// Name and process of the program that has a file open, as far as this user may see it. Of several it is another process of this
-/// program: `firmware-sim` keeps its own end of the line open.
+/// Name and process of the program that has a file open, as far as this user may see it. If there are several, it prefers another
+/// process of this program, because `firmware-sim` keeps its own end of the line open.
 fn holder(path: &str) -> String {
     let wanted = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
     let has_it = |process: &Path| {
@@ -72,7 +72,7 @@ mod tests {
         let path = folder.path().join("port");
         let _held = std::fs::File::create(&path).expect("a file");
         let path = path.display().to_string();
-        // Another program has it too, such as the one at the other end of a pseudo-terminal.
+        // Another program also has it open, such as the one at the other end of a pseudo-terminal.
         let mut other = std::process::Command::new("sleep")
             .arg("60")
             .stdin(std::fs::File::open(&path).expect("a file"))

@@ -1,4 +1,4 @@
-//! What finds a bead or a cell in the frames of a rig.
+//! Builds the localiser of a bead or a cell for the frames of a rig.
 
 use super::{CameraConfig, RigFile};
 use crate::Failure;
@@ -8,10 +8,10 @@ use cellpos_rig::FrameBuffer;
 use cellpos_vision::{CellFinder, Localiser, LocaliserConfig, ProfileSpec};
 
 impl RigFile {
-    /// What finds cells against the empty channel.
+    /// The localiser of cells against the empty channel.
     ///
     /// # Errors
-    /// No background, or one that cannot be used.
+    /// The background is missing or cannot be used.
     pub fn finder(&self) -> Result<CellFinder, Failure> {
         /// Frames of the empty channel that the emulated camera takes first.
         const EMPTY_FRAMES: usize = 100;
@@ -58,10 +58,10 @@ impl RigFile {
         }
     }
 
-    /// What finds beads in frames.
+    /// The localiser of beads.
     ///
     /// # Errors
-    /// As [`RigFile::bead_settings`], or a value of `[vision]` that cannot be.
+    /// As [`RigFile::bead_settings`], or an invalid value of `[vision]`.
     pub fn localiser(&self) -> Result<Localiser, Failure> {
         Localiser::new(self.bead_settings()?).map_err(|error| {
             Failure::bad_input(format!("[vision] {error}"), "see examples/rig.toml")

@@ -1,4 +1,4 @@
-//! Cells as the sequences of a terminal.
+//! Turns cells into the control sequences of a terminal.
 
 use ratatui::backend::{Backend, ClearType, WindowSize};
 use ratatui::buffer::Cell;
@@ -7,7 +7,7 @@ use ratatui::style::{Color, Modifier};
 use std::convert::Infallible;
 use std::fmt::Write;
 
-/// Collects sequences; whoever owns it sends them on. Text is cleaned: what came from a file cannot give the terminal orders.
+/// Collects sequences; its owner sends them. It cleans text, so that text from a file cannot control the terminal.
 #[derive(Debug, Default)]
 pub(super) struct Ansi {
     out: String,

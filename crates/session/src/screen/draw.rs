@@ -1,4 +1,4 @@
-//! How a run looks on the whole terminal, from 40 columns and 12 rows.
+//! Draws a run on the whole terminal, from 40 columns and 12 rows.
 
 use super::history::{History, SPAN_S};
 use cellpos_live::{EventLine, Hello};
@@ -78,7 +78,7 @@ fn banner_line(history: &History) -> Paragraph<'_> {
     ]))
 }
 
-/// The parts side by side, as far as there is room.
+/// The parts next to each other, as far as there is room.
 fn fit(parts: Vec<(String, Style)>, columns: u16) -> Paragraph<'static> {
     let mut spans = vec![];
     let mut room = usize::from(columns);
@@ -138,7 +138,7 @@ fn clock(seconds: f64) -> String {
     format!("{}:{:02}:{:02}", whole / 3600, whole / 60 % 60, whole % 60)
 }
 
-/// What is being done, what comes next, how long it takes.
+/// The present step, the next one, and their durations.
 fn told(history: &History) -> Vec<(String, Style)> {
     let state = &history.state;
     let (plain, quiet) = (Style::new(), Style::new().fg(Color::Gray));
@@ -158,7 +158,7 @@ fn told(history: &History) -> Vec<(String, Style)> {
     parts
 }
 
-/// The PZT within its range, and the displacement at which the liquid stands still.
+/// The PZT within its range, and the displacement of zero flow.
 fn gauge_line(hello: &Hello, history: &History, columns: u16) -> Paragraph<'static> {
     let [low, high] = hello.range_um;
     let (command, rest) = history.last.map_or((f64::NAN, f64::NAN), |row| {
@@ -197,7 +197,7 @@ fn gauge_line(hello: &Hello, history: &History, columns: u16) -> Paragraph<'stat
     Paragraph::new(Line::from(spans))
 }
 
-/// Which values a panel of traces shows.
+/// The values that a panel of traces shows.
 struct Panel {
     unit: &'static str,
     lines: &'static [Trace],
@@ -404,7 +404,7 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
-        // The sine's excursions are drawn.
+        // The picture shows the sine's excursions.
         let dots = text
             .chars()
             .filter(|c| ('\u{2801}'..='\u{28ff}').contains(c));

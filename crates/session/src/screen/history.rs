@@ -1,4 +1,4 @@
-//! What the screen keeps of a run: bounded, whatever its length.
+//! The data that the screen keeps of a run, bounded for any length.
 
 use cellpos_live::{CycleRow, EventLine, Row, State};
 use std::collections::VecDeque;
@@ -46,7 +46,7 @@ pub(super) struct History {
     pub(super) events: VecDeque<EventLine>,
     /// Newest first.
     pub(super) cycles: VecDeque<CycleRow>,
-    /// What was said on the terminal last.
+    /// The last message on the terminal.
     pub(super) said: String,
 }
 
@@ -72,7 +72,7 @@ impl History {
         self.last = Some(*row);
     }
 
-    /// How the run stands; `cell`: a cell is followed rather than a bead.
+    /// Takes the state of the run; `cell`: a cell is tracked instead of a bead.
     pub(super) fn state(&mut self, mut state: State, cell: bool) {
         state.banner.reason = words(&state.banner.reason, cell);
         state.doing = state.doing.map(|text| words(&text, cell));
@@ -80,7 +80,7 @@ impl History {
         self.state = state;
     }
 
-    /// What happened; `cell`: a cell is followed rather than a bead.
+    /// Takes an event; `cell`: a cell is tracked instead of a bead.
     pub(super) fn event(&mut self, event: EventLine, cell: bool) {
         let text = match event.text.starts_with("Note: ") || event.text.starts_with("Mark: ") {
             true => event.text,
@@ -96,7 +96,7 @@ impl History {
     }
 }
 
-/// A sentence of the program as a person reads it: units with their signs, and the cell where one is followed.
+/// A sentence for people: units with their signs, and "cell" if a cell is tracked.
 fn words(text: &str, cell: bool) -> String {
     let set = cellpos_live::terminal::for_people(text);
     if !cell {

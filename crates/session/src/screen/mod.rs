@@ -1,11 +1,12 @@
-//! A run on the whole terminal: state, traces, gauge, events and cycles, for a machine that is reached by SSH alone.
+//! A run on the whole terminal: state, traces, gauge, events and cycles, for a machine with SSH access only.
 //!
 //! ```text
 //! recorder thread -> ring -> screen thread (a picture of cells) -> terminal thread -> terminal
 //! ```
 //!
-//! The screen thread draws ten times a second and never writes: its drawing goes to [`cellpos_live::terminal`], and only its thread
-//! waits for the terminal. A picture that finds the one before it unwritten is left out, and the next one is drawn whole.
+//! The screen thread draws ten times a second and never writes: it passes the picture to [`cellpos_live::terminal`], and only the thread
+//! there waits for the terminal. If the previous picture is not written yet, the new one is skipped, and the next one is drawn
+//! completely.
 
 #[cfg(feature = "screen")]
 mod ansi;
@@ -30,7 +31,7 @@ pub struct ScreenConfig {
     pub typed: Typed,
 }
 
-/// The terminal while a run has it: built without the feature `screen`, no run has.
+/// The terminal of a run. Without the feature `screen` no run has one.
 #[cfg(not(feature = "screen"))]
 pub enum Screen {}
 

@@ -68,7 +68,7 @@ impl Drop for Screen {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
-            // One that panicked has drawn nothing further.
+            // A thread that panicked has drawn nothing further.
             let _ = thread.join();
         }
         cellpos_live::terminal::stderr().close_screen(PATIENCE);
@@ -91,7 +91,7 @@ impl Shown {
                 self.picture(&mut cells);
                 let sequence = cells.backend_mut().take();
                 if !terminal.draw(sequence) {
-                    // What is on the terminal is not known any more.
+                    // The contents of the terminal are unknown now.
                     let _ = cells.clear();
                 }
             }

@@ -1,4 +1,4 @@
-//! The page of a PZT that is moved by hand: no loop is closed, and nothing is recorded.
+//! The page of a PZT moved by hand, without a closed loop and without a recording.
 
 use super::last_word;
 use super::live_view::View;
@@ -6,14 +6,14 @@ use super::watcher::Watcher;
 use crate::words::Level;
 use cellpos_live::{Banner, Row};
 
-/// A millisecond of a PZT that is moved by hand.
+/// One millisecond of a PZT moved by hand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HandStep {
     /// Time since the board was armed, ns.
     pub time_ns: i64,
-    /// Displacement that was commanded, um.
+    /// Commanded displacement, um.
     pub command_um: f64,
-    /// Where the bead was seen last, um; NaN: nowhere, or nobody looked.
+    /// Last seen position of the bead, um; NaN: none, or no camera.
     pub bead_um: f64,
     /// How late the command was, us.
     pub wake_us: f64,
@@ -36,7 +36,7 @@ impl ByHand {
         })
     }
 
-    /// Shows a millisecond, and a few times a second how things stand: `state` (`running`, `frozen`) and why.
+    /// Shows a millisecond and, a few times a second, the `state` (`running`, `frozen`) and its reason.
     pub fn step(&mut self, step: &HandStep, state: &'static str, reason: &str) {
         const TELL_EVERY_NS: i64 = 100_000_000;
         self.watcher.row(&Row {
@@ -65,7 +65,7 @@ impl ByHand {
         self.watcher.tell(time_ns, Level::Info, text);
     }
 
-    /// It is over, for a reason in a sentence.
+    /// Ends the page, for a reason in a sentence.
     pub fn over(mut self, reason: &str) {
         self.watcher.over(last_word::of_reason("stopped", reason));
     }

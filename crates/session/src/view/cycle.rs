@@ -3,7 +3,7 @@
 use cellpos_live::CycleRow;
 use cellpos_script::AtRest;
 
-/// A row of the per-cycle table as a point of the page's trend, its stretch by the cell at rest.
+/// A row of the per-cycle table as a point of the page's trend, its stretch relative to the cell at rest.
 pub fn cycle_row(row: &cellpos_script::CycleRow, rest: &AtRest) -> CycleRow {
     let known = |value: f64| value.is_finite().then_some(value);
     CycleRow {

@@ -11,17 +11,17 @@ use cellpos_live::Hello;
 pub struct Page {
     /// Its name.
     pub name: String,
-    /// What runs, in a few words.
+    /// The run in a few words.
     pub subtitle: String,
     /// Whether the operator may set the target.
     pub steered: bool,
-    /// Whether a script says where the bead is to be.
+    /// Whether a script sets the target.
     pub script: bool,
     /// Whether notes are kept with the run.
     pub notes: bool,
 }
 
-/// What rig and set-up say of a run.
+/// The page's data of a run, from rig and set-up.
 pub(super) fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
     let source = rig.source();
     let diffusion = crate::fit::diffusion_um2_per_s(rig.file(), &setup.model);
@@ -33,7 +33,7 @@ pub(super) fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
     }
 }
 
-/// What set-up and diffusion coefficient (um^2/s) say of a run.
+/// The page's data of a run, from set-up and diffusion coefficient (um^2/s).
 pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
     let limits = setup.controller.limits;
     let timing = &setup.config.timing;
@@ -55,15 +55,15 @@ pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
     }
 }
 
-/// Where in the law's columns those of adaptation begin.
+/// Index of the first column of adaptation among the law's columns.
 fn adaptation_at(setup: &Setup) -> Option<usize> {
     let law = setup.law().ok()?;
     let first = ADAPT_COLUMNS.first()?;
     law.columns().iter().position(|name| name == first)
 }
 
-/// What the linear model of the loop predicts for the measured error while it holds (see [`Hello::predicted_spectrum`]), up to half
-/// the sampling rate; empty for a law without a linear form, a model without noise, or a loop that the model calls unstable.
+/// The spectrum that the loop's linear model predicts for the measured error of a hold (see [`Hello::predicted_spectrum`]), up to half
+/// the sampling rate. Empty for a law without a linear form, a model without noise, or a loop that is unstable on the model.
 fn predicted_spectrum(setup: &Setup, diffusion_um2_per_s: f64) -> Vec<[f64; 3]> {
     const POINTS: usize = 200;
     let end_hz = 0.5e6 / setup.config.timing.period_us;

@@ -1,4 +1,4 @@
-//! The last word of a run on the page, however it ended.
+//! The final message of a run on the page, for every kind of end.
 
 use crate::connect::ENDED;
 use crate::ended::{EndKind, Ended};
@@ -7,21 +7,21 @@ use cellpos_live::LastWord;
 use cellpos_record::RunEnd;
 use cellpos_runtime::life::SafeReason;
 
-/// Where the PZT is when the board took the command to park.
+/// Text on the PZT's place if the board accepted the command to park.
 const AT_PARK: &str = "The PZT is at park, or ramps there.";
-/// Where it was when a run ended that is over for long.
+/// Text for a run that ended long ago.
 const PARKED_THEN: &str = "The program parked the PZT when the run ended.";
-/// Where it is when nobody could see that the board took it.
+/// Text if the acceptance of park was not observed.
 const NOT_SEEN: &str =
     "The board was told to park and has been silent since; its own watchdog parks the PZT.";
-/// Where it is when another host has the board.
+/// Text if another host has the board.
 const FOREIGN: &str =
     "Another program uses the board: this program does not know where the PZT is.";
-/// Where it is when the board was never armed.
+/// Text if the board was never armed.
 const NOT_ARMED: &str = "The board was not armed: the PZT was not moved.";
 
 impl Ended {
-    /// The last word of this end.
+    /// The final message for this end.
     pub fn last_word(&self) -> LastWord {
         let how = match self.kind {
             EndKind::Done | EndKind::ReferenceOver => "done",
@@ -49,7 +49,7 @@ impl Ended {
     }
 }
 
-/// Of a run that was over for a reason in a sentence.
+/// For a run that is over for a reason in a sentence.
 pub(super) fn of_reason(how: &'static str, reason: &str) -> LastWord {
     LastWord {
         how,
@@ -59,7 +59,7 @@ pub(super) fn of_reason(how: &'static str, reason: &str) -> LastWord {
     }
 }
 
-/// Of a run whose board could not be armed.
+/// For a run whose board could not be armed.
 pub(super) fn of_refusal(failure: &Failure) -> LastWord {
     not_armed(&failure.text())
 }
@@ -73,7 +73,7 @@ fn not_armed(why: &str) -> LastWord {
     }
 }
 
-/// Of a run whose program ended without a summary: an error or a panic on one of its threads.
+/// For a run whose program ended without a summary: an error or a panic on one of its threads.
 pub(super) fn of_silence() -> LastWord {
     LastWord {
         how: "failed",
@@ -83,7 +83,7 @@ pub(super) fn of_silence() -> LastWord {
     }
 }
 
-/// Of a run in another program of which nothing is heard any more.
+/// For a run of another program that has fallen silent.
 pub(super) fn of_gone(seconds: u64) -> LastWord {
     LastWord {
         how: "failed",
@@ -96,7 +96,7 @@ pub(super) fn of_gone(seconds: u64) -> LastWord {
     }
 }
 
-/// The recorded end of a run that is read from its folder: the words that its own page had.
+/// The recorded end of a run that is read from its folder, in the words of its own page.
 pub(super) fn of_record(end: &RunEnd) -> LastWord {
     let recorded = end.summary.get(ENDED).cloned();
     if let Some(ended) = recorded.and_then(|ended| ended.try_into::<Ended>().ok()) {

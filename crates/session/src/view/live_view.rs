@@ -18,10 +18,10 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-/// Frames of a clip that the page gets: half a second of a fast camera.
+/// Most frames of a clip on the page: half a second of a fast camera.
 const FILM_FRAMES: usize = 250;
 
-/// How a run is to be shown.
+/// The ways to show a run.
 #[derive(Debug, Clone, Default)]
 pub struct Wanted {
     /// The page in a browser.
@@ -31,7 +31,7 @@ pub struct Wanted {
 }
 
 impl Wanted {
-    /// Whether it is to be shown at all.
+    /// Whether the run is shown at all.
     pub fn is_any(&self) -> bool {
         self.page.is_some() || self.screen.is_some()
     }
@@ -40,7 +40,7 @@ impl Wanted {
 /// Receiver of the operator's requests: the present run, or the last one.
 type Addressee = Arc<Mutex<Arc<Operator>>>;
 
-/// What shows a run, or several one after the other.
+/// Shows a run, or several one after the other.
 pub struct View {
     // Fields are dropped in this order: the terminal is released before further output.
     screen: Option<Screen>,
@@ -56,14 +56,14 @@ impl View {
     /// Shows the next run on a rig: its frames are shown, and its operator takes the requests.
     ///
     /// # Errors
-    /// The address cannot be listened on, or others could reach it without having been asked for.
+    /// The address cannot be used, or other machines could reach it although the user did not request that.
     pub fn of(wanted: &Wanted, rig: &mut Rig, setup: &Setup, page: &Page) -> Result<Self, Failure> {
         let mut view = Self::open(wanted, hello(rig, setup, page), rig.operator())?;
         view.follow(rig);
         Ok(view)
     }
 
-    /// Shows what is said of a run by whoever fills it. The operator's requests go to `operator`.
+    /// Shows a run whose data the caller fills in. The operator's requests go to `operator`.
     ///
     /// # Errors
     /// As [`View::of`].
@@ -78,7 +78,7 @@ impl View {
         if let Some(at) = wanted.page {
             let (mut feed, hub) = Feed::new(hello.clone());
             if let Some(feed) = feed.take_pictures() {
-                // The other end is in this very pair.
+                // The same value holds the other end.
                 let _ = pictures.0.send(Pictures::new(feed));
             }
             let asked = Arc::clone(&addressee);
@@ -108,7 +108,7 @@ impl View {
         })
     }
 
-    /// Turns to the next run on a rig. A stop that was asked for meanwhile holds for it too.
+    /// Switches to the next run on a rig. A stop request in between applies to it too.
     pub fn follow(&mut self, rig: &mut Rig) {
         let operator = Arc::clone(rig.operator());
         let mut addressee = lock(&self.addressee);
@@ -129,7 +129,7 @@ impl View {
         Some(pictures.lend(&self.pictures.0))
     }
 
-    /// The folder of the run, whose clips may be asked for.
+    /// The folder of the run, for requests of its clips.
     pub fn recorded_in(&self, run: &Path) {
         let _ = self.run.set(run.to_owned());
     }
@@ -156,7 +156,7 @@ impl View {
         server.is_some_and(|server| !server.address().ip().is_loopback())
     }
 
-    /// Whether it has the whole terminal.
+    /// Whether the screen uses the whole terminal.
     pub fn has_screen(&self) -> bool {
         self.screen.is_some()
     }
@@ -171,7 +171,7 @@ pub struct Pages {
 }
 
 impl Pages {
-    /// Nothing is shown before the first run; `said` is called then.
+    /// Shows nothing before the first run; then calls `said`.
     pub fn new(wanted: Wanted, page: Page, said: fn(&View)) -> Self {
         Self {
             wanted,
@@ -181,7 +181,7 @@ impl Pages {
         }
     }
 
-    /// Shows the next run on a rig; `None`: nothing is wanted.
+    /// Shows the next run on a rig; `None`: no view was requested.
     ///
     /// # Errors
     /// As [`View::of`].
@@ -199,7 +199,7 @@ impl Pages {
         Ok(self.view.as_mut())
     }
 
-    /// Nothing follows any more, for a reason in a sentence; whether everything was done.
+    /// Ends the series for a reason in a sentence; also states whether everything was done.
     pub fn over(&mut self, done: bool, reason: &str) {
         if let Some(watcher) = self.view.as_mut().and_then(|view| view.watcher.as_mut()) {
             let how = if done { "done" } else { "stopped" };
@@ -227,7 +227,7 @@ fn lock(addressee: &Addressee) -> std::sync::MutexGuard<'_, Arc<Operator>> {
 fn act(command: OperatorRequest, addressee: &Addressee, noted: &Sender<String>) {
     let operator = lock(addressee);
     match command {
-        // A freeze that does not end the run: whoever looks on may want to go on.
+        // A freeze does not end the run: the operator may want to continue.
         OperatorRequest::Freeze | OperatorRequest::Pause => {
             let _ = operator.change(Request::None, Request::Pause)
                 || operator.change(Request::Skip, Request::Pause);
@@ -241,7 +241,7 @@ fn act(command: OperatorRequest, addressee: &Addressee, noted: &Sender<String>) 
                 || operator.change(Request::Pause, Request::Skip);
         }
         OperatorRequest::Target { um } => operator.steer(um),
-        // The run is over: nobody takes notes any more.
+        // The run is over and takes no more notes.
         OperatorRequest::Note { text } => drop(noted.send(text)),
     }
 }

@@ -1,4 +1,4 @@
-//! The operator's view of a run, in a browser or on the whole terminal: a sink that feeds it alongside the recording, and the
+//! The operator's view of a run, in a browser or on the whole terminal. A sink feeds it alongside the recording, and it returns the
 //! operator's requests.
 //!
 //! [`View::open`] serves the page; [`Viewed`] wraps the run's own sink. Everything runs on the threads of recorder, page and screen.

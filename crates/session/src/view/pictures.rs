@@ -1,4 +1,4 @@
-//! What the live page shows of the camera's frames.
+//! The camera's frames on the live page.
 
 use crate::crop::{self, Crop};
 use cellpos_live::{OUTLINE_POINTS, Picture, PictureFeed};
@@ -6,7 +6,7 @@ use cellpos_rig::{FrameWatch, SeenFrame};
 use cellpos_vision::Pixels;
 use std::sync::mpsc::Sender;
 
-/// How a crop moves with the bead: with every pixel it would hide the bead's motion.
+/// Steps in which a crop follows the bead: a crop that moves with every pixel would hide the bead's motion.
 const STEPS: usize = 8;
 
 /// Crops frames for the page.
@@ -29,7 +29,7 @@ impl Pictures {
         }
     }
 
-    /// For the camera of a run; `back` gets them when the run is over.
+    /// For the camera of a run; `back` receives them when the run is over.
     pub(super) fn lend(self, back: &Sender<Pictures>) -> Box<dyn FrameWatch> {
         Box::new(Lent {
             pictures: Some(self),
@@ -57,13 +57,13 @@ impl FrameWatch for Lent {
 impl Drop for Lent {
     fn drop(&mut self) {
         if let Some(pictures) = self.pictures.take() {
-            // Without anybody to take them the page is over.
+            // If nobody receives them, the page is over.
             let _ = self.back.send(pictures);
         }
     }
 }
 
-/// The part of a frame about what is followed, in 8 bits.
+/// The part of a frame around the bead or cell, in 8 bits.
 fn crop(seen: &SeenFrame<'_>, picture: &mut Picture) {
     let crop = Crop::about(seen, crop::MOST, STEPS);
     let shift = seen.bits.saturating_sub(8);

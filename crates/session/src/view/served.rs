@@ -1,4 +1,4 @@
-//! The page of a run, served; without the feature `page` there is none.
+//! Serves the page of a run; without the feature `page` there is no page.
 
 use crate::failure::Failure;
 use cellpos_live::{FeedHub, Film, OperatorRequest};
@@ -7,19 +7,19 @@ use std::net::SocketAddr;
 #[cfg(feature = "page")]
 pub(super) use cellpos_live::Server;
 
-/// Where the page is to be served.
+/// Address of the page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ViewAddress {
     /// Address and port; port 0: any that is free.
     pub address: SocketAddr,
-    /// Whether one that other machines can reach was asked for by name.
+    /// Whether the user explicitly requested an address that other machines can reach.
     pub beyond_this_machine: bool,
 }
 
-/// Serves the page on threads of its own: the ordinary scheduler, not the loop's.
+/// Serves the page on separate threads under the ordinary scheduler, not the loop's.
 ///
 /// # Errors
-/// The address cannot be listened on, or others could reach it without having been asked for.
+/// The address cannot be used, or other machines could reach it although the user did not request that.
 #[cfg(feature = "page")]
 pub(super) fn serve(
     at: ViewAddress,
@@ -37,7 +37,7 @@ pub(super) fn serve(
         .map_err(|error| Failure::bad_input(error, "127.0.0.1:0 takes any free port"))
 }
 
-/// A page that is being served: none is.
+/// The type of a served page; without the feature it has no value.
 #[cfg(not(feature = "page"))]
 pub(super) enum Server {}
 

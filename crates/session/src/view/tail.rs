@@ -1,12 +1,12 @@
 //! The tail of a time, cheap enough for a running run.
 
-/// Steps of an octave: a value is told to 1 part in 64.
+/// Steps of an octave: the resolution is 1 part in 64.
 const STEPS: usize = 64;
 /// Octaves: all that fits in 32 bits of nanoseconds, four seconds.
 const OCTAVES: usize = 32;
 
-/// Times in octaves of 64 equal steps each. Counting changes one number, and the tail is searched from above, so both cost the
-/// thread very little. The run's summary has its own, finer account.
+/// Times in octaves of 64 equal steps each. Counting changes one number, and the search of the tail starts from above, so both
+/// cost the thread little. The run's summary has a separate, finer count.
 #[derive(Debug, Clone)]
 pub(super) struct Tail {
     counts: Box<[u32; STEPS * OCTAVES]>,
@@ -29,7 +29,7 @@ impl Tail {
         self.count += 1;
     }
 
-    /// What 99.9 % of the times do not exceed, us, to the upper end of its step; `None` before the first.
+    /// The 99.9 % quantile of the times, us, at the upper end of its step; `None` before the first.
     pub(super) fn p999_us(&self) -> Option<f64> {
         let above = self.count / 1000;
         let mut seen = 0;
@@ -41,7 +41,7 @@ impl Tail {
     }
 }
 
-/// Where a time is counted.
+/// Index of the step that counts a time.
 fn place(ns: u32) -> usize {
     let bits = (u32::BITS - ns.leading_zeros()) as usize;
     match bits.checked_sub(7) {
@@ -51,7 +51,7 @@ fn place(ns: u32) -> usize {
     }
 }
 
-/// Largest time that is counted in a place, ns.
+/// Largest time that a step counts, ns.
 fn upper_ns(place: usize) -> u64 {
     match (place / STEPS).checked_sub(1) {
         None => place as u64,

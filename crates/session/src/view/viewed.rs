@@ -1,4 +1,4 @@
-//! A sink that shows what passes through it.
+//! A sink that feeds the view with the run that passes through it.
 
 use super::last_word;
 use super::live_view::View;
@@ -9,7 +9,7 @@ use crate::words::Level;
 use cellpos_runtime::{Event, RunSink, Statistics, Summary, TickRecord};
 use std::sync::mpsc::Receiver;
 
-/// A sink that shows page and screen what passes through it.
+/// A sink that feeds page and screen with the run that passes through it.
 pub struct Viewed<S> {
     sink: S,
     page: Option<(Watcher, Receiver<String>)>,
@@ -63,7 +63,7 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
             watcher.show(record);
             watcher.count(record);
             watcher.take_counts(&record.counts);
-            // A freeze is on the page when it is in force, not with the next look.
+            // The page shows a freeze as soon as it is in force, not at its next update.
             if watcher.turns(record) {
                 watcher.stands(record, &self.sink);
             }

@@ -1,4 +1,4 @@
-//! The page of a run that is read from its folder, over or still running in another process.
+//! The page of a run that is read from its folder: a finished run, or one that another process runs.
 
 use super::cycle::cycle_row;
 use super::hello::{Page, hello_of};
@@ -23,14 +23,14 @@ use std::time::{Duration, Instant};
 const ROWS_AT_ONCE: usize = 4096;
 /// Time of a run that the page holds, s.
 const HELD_S: f64 = 600.0;
-/// A run without an end to which nothing was added for this long has lost its program, or its disk.
+/// If nothing is added to an unfinished run for this time, its program or its disk has failed.
 const SILENT_AFTER: Duration = Duration::from_secs(5);
-/// Most of the table of cycles that is read at once, bytes.
+/// Largest part of the table of cycles to read at once, bytes.
 const MOST_TABLE: u64 = 16 << 20;
-/// How often the folder of clips is looked into.
+/// Interval between two looks into the folder of clips.
 const CLIPS_EVERY: Duration = Duration::from_secs(1);
 
-/// A page that shows a run folder. Nothing is asked of the program that writes it, and nothing can be asked through the page.
+/// A page that shows a run folder. It requests nothing from the program that writes it, and accepts no requests itself.
 pub struct Watch {
     server: Server,
     watcher: Watcher,
@@ -52,7 +52,7 @@ impl Watch {
     /// Serves the page of the newest session of a run.
     ///
     /// # Errors
-    /// No run, one whose `run.toml` cannot be used, or an address that cannot be listened on.
+    /// There is no run, its `run.toml` is invalid, or the address cannot be used.
     pub fn open(folder: &Path, at: ViewAddress) -> Result<Self, Failure> {
         let sessions = Sessions::of(folder).map_err(Failure::input)?;
         let newest = sessions.readers.last().map_or(folder, |(_, r)| r.folder());
@@ -97,12 +97,13 @@ impl Watch {
         })
     }
 
-    /// The link, to be printed: it may look.
+    /// The link of a viewer, for printing.
     pub fn link(&self) -> String {
         self.server.viewer_url()
     }
 
-    /// Shows what was written since the last look; a few times a second is enough. Says whether there is more to show at once.
+    /// Shows everything written since the last call; a few calls a second are enough. Returns whether there is more to show at
+    /// once.
     ///
     /// # Errors
     /// The folder cannot be read any more.
@@ -128,7 +129,7 @@ impl Watch {
         Ok(!self.waiting.is_empty())
     }
 
-    /// Takes the new rows; of a long run those that the page can hold are kept, and all are counted.
+    /// Takes the new rows. It counts all of a long run, and keeps those that the page can hold.
     fn read(&mut self) -> Result<(), Failure> {
         let Self {
             follow,
@@ -188,7 +189,7 @@ impl Watch {
         state.rms_nm = self.statistics.rms_measured_nm();
         state.fix_noise_nm = self.statistics.fix_noise_um().map(|um| um * 1e3);
         let silent = self.changed.elapsed() > SILENT_AFTER;
-        // The end is written behind the last row: it is looked for when none comes any more.
+        // The end comes after the last row, so look for it when no row comes any more.
         let end = (self.changed.elapsed() > SILENT_AFTER / 5)
             .then(|| self.follow.end())
             .flatten();
@@ -197,7 +198,7 @@ impl Watch {
             conclude(&mut self.watcher, &end);
             return;
         }
-        // A run that is written again takes its last word back.
+        // If a run continues, its final message is withdrawn.
         state.last_word = None;
         if silent {
             let word = last_word::of_gone(self.changed.elapsed().as_secs());
@@ -222,7 +223,7 @@ struct CyclesRead {
 }
 
 impl CyclesRead {
-    /// The rows behind those that were read before; none where the table cannot be read.
+    /// The rows after those read before; none if the table cannot be read.
     fn more(&mut self, path: &Path) -> Vec<CycleRow> {
         let length = std::fs::metadata(path).map_or(0, |meta| meta.len());
         if length <= self.bytes {
@@ -233,7 +234,7 @@ impl CyclesRead {
             file.seek(SeekFrom::Start(self.bytes))?;
             let mut text = vec![];
             file.take(MOST_TABLE).read_to_end(&mut text)?;
-            // What is not whole may end within a character; it is read again.
+            // An incomplete line may end within a character; it is read again.
             Ok(String::from_utf8_lossy(&text).into_owned())
         };
         let Ok(text) = read() else { return vec![] };
@@ -329,7 +330,7 @@ mod tests {
         writeln!(file, "{}\n{}", CycleRow::csv_head(), row(0)).unwrap();
         assert_eq!(numbers(read.more(&path)), [0]);
         assert!(read.more(&path).is_empty(), "none twice");
-        // A row that is not whole yet is read when it is.
+        // An incomplete row is read once it is complete.
         let (second, third) = (row(1), row(2));
         let (half, rest) = third.split_at(third.len() / 2);
         write!(file, "{second}\n{half}").unwrap();

@@ -13,11 +13,11 @@ use cellpos_runtime::{
 
 /// Further facts of a sink for the page, besides the rows.
 pub trait Shown {
-    /// Completes how the run stands.
+    /// Completes the state of the run.
     fn complete(&self, state: &mut State) {
         let _ = state;
     }
-    /// The next cycle that was finished since.
+    /// The next newly finished cycle.
     fn next_cycle(&mut self) -> Option<CycleRow> {
         None
     }
@@ -25,7 +25,7 @@ pub trait Shown {
     fn next_line(&mut self) -> Option<EventLine> {
         None
     }
-    /// The next clip that was written since.
+    /// The next newly written clip.
     fn next_clip(&mut self) -> Option<ClipLine> {
         None
     }
@@ -33,7 +33,7 @@ pub trait Shown {
 
 impl Shown for NoSink {}
 
-/// States between two reports of the tails of the ticks' times.
+/// Number of states between two reports of the tails of the ticks' times.
 const TAILS_EVERY: u32 = 10;
 
 /// Feeds page and screen with rows of the recorder, or with rows read from a folder.
@@ -49,7 +49,7 @@ pub(super) struct Watcher {
     standing: (u8, bool),
     /// Ticks, time in s, and counts of the runs before this one on the same page.
     before: (u64, f64, TickCounts),
-    /// Where in the law's columns those of adaptation begin.
+    /// Index of the first column of adaptation among the law's columns.
     adaptation_at: Option<usize>,
 }
 
@@ -162,7 +162,7 @@ impl Watcher {
         state.coasted += u64::from(record.flags.has(TickFlags::COASTING));
     }
 
-    /// Takes the loop's own counts: those of the summary, had the run ended with this tick.
+    /// Takes the loop's own counts: the summary as if the run had ended with this tick.
     pub(super) fn take_counts(&mut self, counts: &TickCounts) {
         let (.., before) = &self.before;
         self.state.skipped = before.skipped + counts.skipped;
@@ -170,13 +170,13 @@ impl Watcher {
         self.state.stale = before.stale + counts.stale;
     }
 
-    /// Whether a tick stands otherwise than the one before: frozen, parked, or going on.
+    /// Whether a tick differs in state from the one before: frozen, parked or running.
     pub(super) fn turns(&mut self, record: &TickRecord) -> bool {
         let standing = (record.life, record.flags.has(TickFlags::FREEZE));
         std::mem::replace(&mut self.standing, standing) != standing
     }
 
-    /// Tells how the run stands after a tick.
+    /// Reports the state of the run after a tick.
     pub(super) fn stands(&mut self, record: &TickRecord, sink: &impl Shown) {
         self.state.banner = self.banner(record);
         sink.complete(&mut self.state);
@@ -206,7 +206,7 @@ impl Watcher {
         });
     }
 
-    /// Tells how the run stands.
+    /// Reports the state of the run.
     pub(super) fn progress(&mut self, statistics: &Statistics, sink: &impl Shown) {
         let Some(record) = statistics.last() else {
             return;
@@ -217,7 +217,7 @@ impl Watcher {
         self.stands(record, sink);
     }
 
-    /// The tails of the ticks' times, now and then: they are looked for in all that was counted.
+    /// Reports the tails of the ticks' times from time to time: a search through all counts.
     pub(super) fn tails(&mut self) {
         if self.told.is_multiple_of(TAILS_EVERY) {
             self.state.wake_us = self.wake.p999_us();
@@ -290,7 +290,7 @@ impl Watcher {
 }
 
 impl Drop for Watcher {
-    /// A run that came to no summary has a last word nevertheless.
+    /// A run without a summary has a final message nevertheless.
     fn drop(&mut self) {
         if self.state.last_word.is_none() && self.state.ticks > 0 {
             self.over(last_word::of_silence());

@@ -59,7 +59,7 @@ pub struct Acquired {
     pub fix_noise_um: Option<f64>,
     /// The whole run since the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN without one.
     pub rows: (Vec<f64>, Vec<f64>),
-    /// Number of rows whose frame came but showed no reliable bead.
+    /// Whether a row's frame came but showed no reliable bead.
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,

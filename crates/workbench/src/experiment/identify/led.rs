@@ -100,7 +100,7 @@ impl DelayTest {
         self.estimate.ci95_s = self.estimate.ci95_s.map(|end| end + age_s);
     }
 
-    /// The warning if the test determines the delay to less than a tenth of a millisecond.
+    /// The warning if the test leaves the delay open by more than a tenth of a millisecond.
     pub fn vague(&self) -> Option<String> {
         /// 10.8 degrees at 300 Hz.
         const WORTH_SAYING_S: f64 = 1e-4;
