@@ -18,14 +18,13 @@ const MEMORY: f64 = MEMORY_FIXES / BLOCK as f64;
 /// Standard deviation of the commanded motion over the chosen motion, a lag, before it was seen. The loop leaves the dither alone, so it
 /// answers what a wrong gain makes of it only: half of that in a tick, and the gain is wrong by half.
 const ANSWER: f64 = 0.25;
-/// Blocks that the noise of the design counts as. A block that is farther off than its noise explains is one of a distribution with that many
-/// blocks' degrees of freedom (Student's).
-const STATED: f64 = 8.0;
+/// Blocks from which the noise of a block is known. It is integrated out: a block is one of Student's distribution.
+const SCALE_BLOCKS: f64 = 8.0;
 
 /// Part of a mean of the noise that a new one of `count` values makes up, with a memory of `memory` values. What the design states counts as
-/// [`STATED`] blocks.
+/// one block.
 pub(super) fn part(count: f64, memory: f64) -> f64 {
-    1.0 / (count + STATED / MEMORY * memory).min(memory)
+    1.0 / (count + memory / MEMORY).min(memory)
 }
 
 type Vector = [f64; MEMBERS];
@@ -146,9 +145,10 @@ impl Evidence {
         let white = forward(&l, &left);
         let left_um2 = dot(&white, &white) / MEMBERS as f64;
         self.blocks += 1.0;
+        let scale = self.blocks.min(SCALE_BLOCKS);
+        let weight = (scale + 1.0) / (scale * self.noise_um2 + left_um2);
+        self.noise_um2 += (left_um2 - self.noise_um2) / (scale + 1.0);
         let part = part(self.blocks, MEMORY);
-        self.noise_um2 += part * (left_um2 - self.noise_um2);
-        let weight = (STATED + 1.0) / (STATED * self.noise_um2 + left_um2);
         // The commands answer the disturbance, so their products in this block correlate with its noise. How they follow the motion that was
         // chosen is known from the blocks before.
         let answered: Vector =

@@ -90,7 +90,9 @@ impl Adapter {
         let ago = fix.age as f64 + fix.offset;
         let apart = state.since_fix - ago;
         state.since_fix = ago;
-        let correction = (self.whitener).correction(state.covariance, apart, fix.variance_um2);
+        let usual_um2 = state.noise.usual_um2;
+        let correction =
+            (self.whitener).correction(state.covariance, apart, fix.variance_um2, usual_um2);
         let series = (state.seen.as_mut())
             .zip(state.model.innovations(&correction, &at_um))
             .zip(state.instrument.innovations(&correction, &chosen_um));

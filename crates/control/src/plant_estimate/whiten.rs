@@ -34,7 +34,7 @@ pub(super) struct Correction {
     gain: [f64; 2],
     /// Covariance after it.
     pub after: Covariance,
-    /// What makes the variance of an innovation that of [`Whitener::noise_um2`]: less than 1 after a gap, more where a fix is better
+    /// What makes the variance of an innovation that of one of a fix that comes regularly: less than 1 after a gap, more where a fix is better
     /// than was assumed.
     pub weight: f64,
 }
@@ -101,12 +101,15 @@ impl Whitener {
         self.settled
     }
 
-    /// Correction by a fix of this variance, um^2, `ticks` after the one before.
+    /// Correction by a fix of this variance, um^2, `ticks` after the one before. `usual_um2` is the variance of the innovations of fixes
+    /// that come regularly: what is more than [`Whitener::noise_um2`] is a disturbance. In a gap it goes on and nothing is learned of it.
+    /// How it is coloured over the gap is not known, so it counts as if all innovations that are missing had the same sign.
     pub(super) fn correction(
         &self,
         [pp, pd, dd]: Covariance,
         ticks: f64,
         fix_um2: f64,
+        usual_um2: f64,
     ) -> Correction {
         let fix_um2 = fix_um2.max(self.least_um2);
         let ticks = ticks.clamp(APART.0, APART.1);
@@ -116,11 +119,15 @@ impl Whitener {
             dd + self.drift_um2 * ticks,
         ];
         let (gain, after) = corrected(prior, fix_um2);
+        let usual_um2 = usual_um2.max(self.noise_um2);
+        let missed = (ticks / self.ticks - 1.0).max(0.0);
+        let unseen = 1.0 + missed * (self.gain[0] + 0.5 * self.gain[1] * ticks);
+        let disturbed_um2 = unseen * unseen * (usual_um2 - self.noise_um2);
         Correction {
             ticks,
             gain,
             after,
-            weight: (self.noise_um2 / (prior[0] + fix_um2)).sqrt(),
+            weight: (usual_um2 / (prior[0] + fix_um2 + disturbed_um2)).sqrt(),
         }
     }
 
@@ -157,6 +164,44 @@ impl Correction {
 mod tests {
     use super::*;
 
+    /// A sine beside the walk, with every second gap of some length: the weighed innovation after a gap is no larger than usual.
+    #[test]
+    fn what_shakes_the_bead_in_a_gap_makes_the_fix_after_it_worth_less() {
+        let whitener = Whitener::new(3.3e-4, 1e-9, 4e-4, 1.0).unwrap();
+        for (hz, um) in [(0.7, 2.0), (7.0, 0.5), (50.0, 0.3), (150.0, 0.1)] {
+            for gap in [2, 10, 100] {
+                let mut random = cellpos_numeric::Random::new(gap);
+                let mut filter = whitener.settled();
+                let mut track = Whitener::begin(0.0);
+                let (mut walk_um, mut last) = (0.0, 0);
+                let (mut usual_um2, mut after_um2, mut gaps) = (whitener.noise_um2, 0.0, 0.0);
+                for tick in 0..400_000_u64 {
+                    walk_um += 3.3e-4_f64.sqrt() * random.normal();
+                    if tick % 1997 != 0 && tick % 1997 < gap {
+                        continue;
+                    }
+                    let line_um = um * (std::f64::consts::TAU * hz * 5e-4 * tick as f64).sin();
+                    let seen_um = walk_um + line_um + 0.02 * random.normal();
+                    let ticks = (tick - last) as f64;
+                    let fix = whitener.correction(filter, ticks, 4e-4, usual_um2);
+                    let innovation = fix.innovation(&track, seen_um);
+                    fix.step(&mut track, innovation);
+                    (filter, last) = (fix.after, tick);
+                    let weighed_um2 = (fix.weight * innovation).powi(2);
+                    if tick > 10_000 && ticks > 1.0 {
+                        after_um2 += weighed_um2;
+                        gaps += 1.0;
+                    } else {
+                        usual_um2 += 1e-3 * (weighed_um2 - usual_um2);
+                    }
+                }
+                let part = after_um2 / gaps / usual_um2;
+                // A slow line is hardly larger than the noise by which it is measured: 1.6.
+                assert!(part < 1.8, "{hz} Hz, {gap} ticks: {part} of {usual_um2}");
+            }
+        }
+    }
+
     #[test]
     fn fixes_that_come_as_they_should_keep_the_covariance_and_after_a_gap_it_comes_back() {
         for ticks in [1.0, 2.0, 5.0] {
@@ -166,13 +211,13 @@ mod tests {
                     .zip(b)
                     .all(|(a, b)| (a - b).abs() < 1e-9 * b.abs().max(1e-9))
             };
-            let one = whitener.correction(whitener.settled(), ticks, 4e-4);
+            let one = whitener.correction(whitener.settled(), ticks, 4e-4, 0.0);
             assert!(near(one.after, whitener.settled()), "{one:?}");
             assert!((one.weight - 1.0).abs() < 1e-9, "{one:?}");
-            let mut gap = whitener.correction(whitener.settled(), 3.0 * ticks, 4e-4);
+            let mut gap = whitener.correction(whitener.settled(), 3.0 * ticks, 4e-4, 0.0);
             assert!(gap.weight < 0.8, "{gap:?}");
             for _ in 0..20_000 {
-                gap = whitener.correction(gap.after, ticks, 4e-4);
+                gap = whitener.correction(gap.after, ticks, 4e-4, 0.0);
             }
             assert!(near(gap.after, whitener.settled()), "{gap:?}");
         }

@@ -112,6 +112,8 @@ struct Row {
     stalls: f64,
     /// The gain halves in this time, s.
     halves_s: f64,
+    /// Time from the start, and from the step of the gain, from which on statements count, s.
+    settle_s: usize,
 }
 
 /// What came of it.
@@ -129,7 +131,7 @@ struct Kept {
     sd: f64,
 }
 
-/// Seconds of a stay; statements count from 10 s after its start and after the step of the gain.
+/// Seconds of a stay.
 fn stay(row: &Row, seed: u64, seconds: usize, kept: &mut Kept) {
     let base = config(ControllerConfig::Lqg(Lqg::default()));
     let rate = row.rate;
@@ -154,7 +156,7 @@ fn stay(row: &Row, seed: u64, seconds: usize, kept: &mut Kept) {
     let mut stalls = Random::new(seed ^ 0x5741_11ed);
     let mut stalled = 0_usize;
     let mut command_um = NEUTRAL_UM;
-    let (ticks, settle) = (seconds * 1000 * rate, 10_000 * rate);
+    let (ticks, settle) = (seconds * 1000 * rate, row.settle_s * 1000 * rate);
     for tick in 0..ticks {
         if tick == ticks / 2 && row.gain[0] != row.gain[1] {
             world.gain = row.gain[1];
@@ -240,6 +242,7 @@ fn plain(rate: usize) -> Row {
         late_ticks: 0,
         stalls: 0.0,
         halves_s: f64::INFINITY,
+        settle_s: 10,
     }
 }
 
@@ -265,6 +268,18 @@ fn a_rig_written_apart_with_stalls_is_stated_as_it_is() {
     ];
     let broken: Vec<_> = rows.iter().filter_map(|row| judge(row, 2, 60)).collect();
     assert!(broken.is_empty(), "{broken:#?}");
+}
+
+/// In a stall a line moves the bead on, and the dither as well.
+#[test]
+fn a_strong_line_and_stalls_from_the_start_on_are_no_change_of_the_gain() {
+    let row = Row {
+        flow: Flow::Lines(50.0, 0.3, 3),
+        stalls: 1.0,
+        settle_s: 0,
+        ..plain(2)
+    };
+    assert_eq!(judge(&row, 60, 4), None);
 }
 
 #[test]
