@@ -1,11 +1,11 @@
 //! Axes: scale, range, ticks and their labels.
 
-/// How values are laid along an axis.
+/// The mapping of values to an axis.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scale {
     /// Equal differences, equal lengths.
     Linear,
-    /// Equal ratios, equal lengths; values that are not positive are left out.
+    /// Equal ratios have equal lengths; values that are not positive are left out.
     Log,
     /// Named places at 0, 1, 2, ...
     Categories(Vec<String>),
@@ -68,7 +68,7 @@ impl Axis {
         }
     }
 
-    /// Whether a value can be placed on this axis.
+    /// Whether a value has a place on this axis.
     pub(crate) fn places(&self, value: f64) -> bool {
         value.is_finite() && (self.scale != Scale::Log || value > 0.0)
     }
@@ -193,7 +193,7 @@ impl<'a> Placed<'a> {
     fn log_ticks(&self, most: f64) -> Vec<Tick> {
         let (low, high) = (self.low.log10(), self.high.log10());
         let decades = high - low;
-        // Written so that a range that makes no sense gives no ticks.
+        // The comparison is such that an invalid range gives no ticks.
         if !(0.0..700.0).contains(&decades) {
             return Vec::new();
         }

@@ -5,9 +5,9 @@ use cellpos_table::csv_field;
 use std::fmt::Write;
 
 impl Figure {
-    /// The data of the figure, undecimated, one line per point:
-    /// `panel,series,x,x_axis,y,low,high,y_axis` with label and unit of the axes in `x_axis` and `y_axis`. A heat map
-    /// has its rows as series and its columns as x; so has a mosaic, whose y is what its label names.
+    /// The data of the figure, undecimated, one line per point: `panel,series,x,x_axis,y,low,high,y_axis` with label
+    /// and unit of the axes in `x_axis` and `y_axis`. A heat map and a mosaic have their rows as series and their
+    /// columns as x; the y of a mosaic is the quantity of its label.
     pub fn to_csv(&self) -> String {
         figure(self)
     }
@@ -17,7 +17,7 @@ fn field(text: &str) -> String {
     csv_field(text).into_owned()
 }
 
-/// A number that reads back to the same bits; nothing for one that does not exist.
+/// A number that reads back to the same bits; empty if missing.
 fn number(value: Option<f64>) -> String {
     match value {
         Some(value) if value.is_finite() => format!("{value}"),

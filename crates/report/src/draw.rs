@@ -11,14 +11,14 @@ use crate::svg::{self, SLIM_PX, STYLE, WIDTH_PX, px};
 use std::fmt::Write;
 
 impl Figure {
-    /// The figure as an SVG document that stands alone (no script, no external font).
+    /// The figure as a self-contained SVG document (no script, no external font).
     pub fn to_svg(&self) -> String {
         figure(self, true, WIDTH_PX)
     }
 }
 
 /// The figure in a page: as wide as the screen. For narrow screens there is a second copy with the panels below each other and
-/// letters of the same size. A heat map has its numbers in a row: there it is moved sideways.
+/// letters of the same size. A heat map keeps its rows of numbers and scrolls sideways.
 pub(crate) fn in_page(shown: &Figure) -> String {
     let wide = figure(shown, false, WIDTH_PX);
     match &shown.content {
@@ -77,7 +77,7 @@ fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_p
     };
     let width = width_px / columns as f64;
     let mut top = 4.0;
-    // The legend of a colour is not repeated.
+    // Do not repeat the legend of a colour.
     let mut told: Vec<Entry<'_>> = Vec::new();
     if let Some((first, others)) = panels.split_first()
         && columns > 1
@@ -132,7 +132,7 @@ mod tests {
         attribute(tag, name).and_then(|n| n.parse().ok()).unwrap()
     }
 
-    /// The upright texts of a drawing that do not lie within it, or within the panel that clips them.
+    /// The horizontal texts of a drawing that extend beyond it, or beyond the panel that clips them.
     fn clipped(svg: &str) -> Vec<String> {
         let mut open: Vec<(f64, f64, f64)> = Vec::new();
         let mut found = Vec::new();

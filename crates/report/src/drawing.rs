@@ -1,11 +1,11 @@
-//! What a figure consists of, before it becomes SVG or PDF.
+//! The elements of a figure, before it becomes SVG or PDF.
 
 use crate::picture::base64;
 use crate::svg::{px, set};
 use crate::tile::Tile;
 use std::fmt::Write;
 
-/// Where a text is held.
+/// The anchor of a text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Anchor {
     Start,
@@ -35,7 +35,7 @@ pub(crate) enum Shape {
         at: (f64, f64),
         size: (f64, f64),
     },
-    /// A rectangle of a colour of its own.
+    /// A rectangle with a given colour.
     Filled {
         rgb: (u8, u8, u8),
         at: (f64, f64),
@@ -60,7 +60,7 @@ pub(crate) enum Shape {
         size: (f64, f64),
         tile: Tile,
     },
-    /// What follows, until [`Shape::Leave`], is measured from here and clipped to this size.
+    /// All shapes up to [`Shape::Leave`] are measured from here and clipped to this size.
     Enter {
         at: (f64, f64),
         size: (f64, f64),

@@ -12,7 +12,7 @@ pub(crate) struct Marker {
     pub(crate) vertical: bool,
 }
 
-/// One plot: two axes and what is drawn between them.
+/// One plot: two axes and the series between them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Panel {
     pub(crate) title: String,
@@ -74,7 +74,7 @@ impl Panel {
         self
     }
 
-    /// The same length for the same difference on both (linear) axes, for plots in a plane.
+    /// Gives both (linear) axes the same scale, for plots in a plane.
     #[must_use]
     pub fn equal_axes(mut self) -> Self {
         self.equal = true;
@@ -251,7 +251,7 @@ impl Figure {
         )
     }
 
-    /// Adds a panel below (or, with [`Figure::columns`], beside) the others. On a heat map this has no effect.
+    /// Adds a panel below the others or, with [`Figure::columns`], next to them. On a heat map this has no effect.
     #[must_use]
     pub fn panel(mut self, panel: Panel) -> Self {
         if let Content::Panels(panels) = &mut self.content {

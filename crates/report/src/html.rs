@@ -16,7 +16,7 @@ pub enum ReportError {
     /// A file or folder could not be written.
     #[error("cannot write {path}: {source}")]
     Write {
-        /// What was to be written.
+        /// The file or folder.
         path: PathBuf,
         /// Why it failed.
         source: std::io::Error,
@@ -87,12 +87,12 @@ impl Report {
         self.push(Block::Result(status, sentence.to_owned()))
     }
 
-    /// Says below the result how sure it is: of what its intervals are, and what they leave out.
+    /// Adds a line on the uncertainty below the result: the kind of its intervals, and the errors that they do not cover.
     pub fn certainty(&mut self, text: &str) -> &mut Self {
         self.push(Block::Certainty(text.to_owned()))
     }
 
-    /// Says below the title what was done: with what, how, when. A text of more than 400 characters is cut.
+    /// Adds a line below the title on the work done: means, method, time. Cuts a text at 400 characters.
     pub fn lead(&mut self, text: &str) -> &mut Self {
         const MOST: usize = 400;
         let mut shown: String = text.chars().take(MOST).collect();
@@ -103,7 +103,7 @@ impl Report {
         self
     }
 
-    /// What is added until [`Report::unfold`] is folded behind this title: it is there, and not in the way.
+    /// Folds everything added until [`Report::unfold`] behind this title.
     pub fn fold(&mut self, title: &str) -> &mut Self {
         self.push(Block::Fold(title.to_owned()))
     }
@@ -119,7 +119,7 @@ impl Report {
         self.push(Block::List(items))
     }
 
-    /// Adds the command that made the page, as its last section: it repeats what was done.
+    /// Adds the command that made the page, as its last section, so that a reader can repeat it.
     pub fn command(&mut self, line: &str) -> &mut Self {
         self.section("Command").verbatim(line)
     }
@@ -192,7 +192,7 @@ impl Report {
         for block in &self.blocks {
             match block {
                 Block::Section(title) => {
-                    // Behind the result, which comes first.
+                    // After the result, which comes first.
                     if section == 0 && sections.len() > 3 {
                         contents(&mut out, &sections);
                     }
@@ -322,7 +322,7 @@ impl Report {
     }
 }
 
-/// What a figure can be taken along as.
+/// The formats in which a figure can be downloaded.
 #[derive(Debug, Clone, Copy)]
 enum Form {
     Svg,
@@ -356,7 +356,7 @@ impl Form {
     }
 }
 
-/// The sections, to jump to.
+/// Links to the sections.
 fn contents(out: &mut String, sections: &[&String]) {
     out.push_str("<nav><ul>\n");
     for (index, title) in (1..).zip(sections) {
@@ -396,7 +396,7 @@ fn encoded(name: &str) -> String {
     out
 }
 
-/// Whether there is something of this name that is no file: a device or a pipe, which no file may take the place of.
+/// Whether the name belongs to a device or a pipe, which no file may replace.
 fn is_device(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir())
 }

@@ -1,13 +1,13 @@
 //! Self-contained HTML reports with inline SVG plots.
 //!
-//! A [`Report`] is a title and a sequence of sections, paragraphs, notes, tables and [`Figure`]s. It becomes one
-//! HTML file that loads nothing from the network and suits light and dark screens. Every figure can also be written as SVG,
-//! PDF and CSV. The same calls always give the same bytes: nothing here reads a clock, a locale or a random number.
+//! A [`Report`] is a title and a sequence of sections, paragraphs, notes, tables and [`Figure`]s. It becomes one HTML file, which
+//! loads nothing from the network and suits light and dark screens. Every figure can also be written as SVG, PDF and CSV. The
+//! same calls always give the same bytes: nothing here reads a clock, a locale or a random number.
 //!
 //! Long traces are thinned to the minimum and maximum of each pixel column, so an hour at 1 kHz stays a small picture with
 //! every spike in it. [`Figure::to_csv`] writes the data as given. Axes carry their unit.
 //!
-//! Not for interactive plots, and not for numbers that a program should read: write JSON for that.
+//! Not for interactive plots. Not for numbers that a program should read: write JSON for that.
 //!
 //! ```
 //! use cellpos_report::{Axis, Figure, Panel, Report, Series};

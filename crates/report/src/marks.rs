@@ -35,7 +35,7 @@ pub(crate) fn draw_series(
             }
             for run in runs(series, x, y) {
                 let mut points = thin::line(if step { stairs(run) } else { run });
-                // A line of one point would not show; round ends make it a dot.
+                // A line of one point would be invisible; round ends make it a dot.
                 if let [only] = points.as_slice() {
                     points.push(*only);
                 }
@@ -54,7 +54,7 @@ pub(crate) fn draw_series(
                     let (_, low, high) = series.values(index);
                     let place = |value: Option<f64>| value.and_then(|value| y.at(value));
                     let at = series.x.get(index).and_then(|value| x.at(*value));
-                    // One that its point covers cannot be seen.
+                    // An interval smaller than its point is invisible.
                     if let (Some(at), Some(low), Some(high)) = (at, place(low), place(high))
                         && (high - low).abs() > 2.0 * radius
                     {
@@ -90,7 +90,7 @@ pub(crate) fn draw_series(
             for (centre, value) in series.x.iter().zip(heights) {
                 let ends = (x.at(centre - width / 2.0), x.at(centre + width / 2.0));
                 if let ((Some(from), Some(to)), Some(end)) = (ends, y.at(*value)) {
-                    // A sliver between neighbours keeps the bars apart.
+                    // A narrow gap keeps the bars apart.
                     let gap = if to - from > 4.0 { 0.5 } else { 0.0 };
                     drawing.rect(
                         &format!("bar f{color}"),

@@ -60,13 +60,13 @@ pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
                         take(x - width / 2.0);
                         take(x + width / 2.0);
                     }
-                    // A place without a point is no reason for a longer axis.
+                    // A place without a point must not extend the axis.
                     Kind::Points { .. } if !series.values(index).0.is_some_and(f64::is_finite) => {}
                     _ => take(x),
                 }
                 continue;
             }
-            // What lies outside a fixed range of x must not stretch y.
+            // Points outside a fixed range of x must not extend y.
             if panel.x.range.is_some_and(|(a, b)| x < a || x > b) {
                 continue;
             }
@@ -183,7 +183,7 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
     end - frame.top
 }
 
-/// Where the axes of a panel enclose its data, px.
+/// The rectangle between the axes of a panel, px.
 struct Area {
     left: f64,
     top: f64,

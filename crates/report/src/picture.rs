@@ -8,7 +8,7 @@ use std::fmt::Write;
 pub(crate) struct Picture {
     /// Name of its file, when it is taken along.
     pub(crate) name: String,
-    /// What it shows, for whoever cannot see it.
+    /// Description for readers who cannot see it.
     pub(crate) shows: String,
     pub(crate) caption: String,
     /// A PNG file.

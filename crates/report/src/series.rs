@@ -1,4 +1,4 @@
-//! What is drawn in a panel: lines, steps, points, bands, bars.
+//! The series of a panel: lines, steps, points, bands, bars.
 
 /// How a series is drawn, with its data other than `x`.
 #[derive(Debug, Clone, PartialEq)]
@@ -146,8 +146,8 @@ impl Series {
         Self::bars(label, &centres, &counts, width)
     }
 
-    /// Takes the colour with this number of the palette instead of the next free one, so that a band and its line, or
-    /// the same quantity in two panels, look alike.
+    /// Uses the colour with this number of the palette instead of the next free one. So a band and its line, or the
+    /// same quantity in two panels, have one colour.
     #[must_use]
     pub fn color(mut self, number: usize) -> Self {
         self.color = Some(number);

@@ -1,4 +1,4 @@
-//! What SVG elements have in common: numbers, text, styles.
+//! Common parts of SVG elements: numbers, text, styles.
 
 use crate::typeset::typeset;
 /// Style shared by all figures. Plain rules instead of CSS variables: several SVG viewers know no variables.
@@ -27,9 +27,9 @@ pub(crate) const STYLE: &str = "\
 
 /// Width of every figure, px.
 pub(crate) const WIDTH_PX: f64 = 820.0;
-/// Width of a figure for a narrow screen, px: shown on one of 400 px its letters keep ten of their twelve.
+/// Width of a figure for a narrow screen, px: on a screen of 400 px its 12 px letters are shown with 10 px.
 pub(crate) const SLIM_PX: f64 = 400.0;
-/// The palette on paper: Okabe and Ito's, darkened where white paper asks for it. The style sheet has the same colours.
+/// The palette on paper: Okabe and Ito's, partly darkened for white paper. The style sheet has the same colours.
 pub(crate) const PALETTE: [u32; 8] = [
     0x0072b2, 0xd55e00, 0x009e73, 0xb2589a, 0xb98200, 0x3f9bd1, 0x6b5fc7, 0x444b55,
 ];
@@ -75,7 +75,7 @@ pub(crate) fn set_together(text: &str) -> String {
     out
 }
 
-/// A coordinate to a tenth of a pixel, as short as it goes.
+/// A coordinate to a tenth of a pixel, in its shortest form.
 pub(crate) fn px(value: f64) -> String {
     let tenths = if value.is_finite() {
         (value * 10.0).round().clamp(-1e9, 1e9) as i64

@@ -1,9 +1,9 @@
-//! Tables, and how a row or a note is meant.
+//! Tables, and the meaning of a row or note.
 
 use crate::svg::set;
 use std::fmt::Write;
 
-/// How a note or a row is meant.
+/// The meaning of a note or a row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Emphasis {
     /// Neither good nor bad.
@@ -77,7 +77,7 @@ impl Table {
         Self::with_columns(columns.to_vec())
     }
 
-    /// A table without rows, for a number of columns known only when running.
+    /// A table without rows, for a number of columns known only at run time.
     pub fn with_columns(columns: Vec<Column>) -> Self {
         Self {
             columns,
@@ -110,7 +110,7 @@ impl Table {
         self.row_with(Emphasis::Plain, cells)
     }
 
-    /// Adds a row that is marked as good, to be looked at, or bad.
+    /// Adds a row with a mark: good, to be checked, or bad.
     pub fn row_with<I>(&mut self, status: Emphasis, cells: I) -> &mut Self
     where
         I: IntoIterator,
@@ -151,7 +151,7 @@ impl Table {
             out.push_str("</tr>\n");
         }
         out.push_str("</tbody></table></div>\n");
-        // Outside of what scrolls: on a narrow screen it is read whole.
+        // Outside of the scrolled part, so that a narrow screen shows all of it.
         if !self.caption.is_empty() {
             let _ = writeln!(out, "<p class=\"caption\">{}</p>", set(&self.caption));
         }

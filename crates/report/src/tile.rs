@@ -11,6 +11,6 @@ pub struct Tile {
     pub pixels: Vec<u8>,
     /// The same as a PNG file.
     pub png: Vec<u8>,
-    /// What the figure's CSV says of it, in the mosaic's unit.
+    /// Its value in the figure's CSV, in the mosaic's unit.
     pub value: f64,
 }

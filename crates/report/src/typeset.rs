@@ -8,7 +8,7 @@ const WORDS: [(&str, &str); 5] = [
     ("rtHz", "\u{221a}Hz"),
     ("+-", "\u{b1}"),
 ];
-/// Units that are words of English, too: they follow a number, or stand alone in brackets.
+/// Units that are also English words: they count only after a number, or alone in brackets.
 const AFTER_NUMBERS: [(&str, &str); 2] = [("us", "\u{b5}s"), ("deg", "\u{b0}")];
 
 /// A text with its units as people write them. Names of keys, columns and files stay as they are.
@@ -20,7 +20,7 @@ pub fn typeset(text: &str) -> String {
         if starts_word(before) {
             let words = WORDS.iter().map(|pair| (pair, true));
             let others = AFTER_NUMBERS.iter().map(|pair| (pair, false));
-            // The longer of two that begin alike is tried first.
+            // Of two with the same beginning, try the longer first.
             for ((name, sign), alone) in words.rev().chain(others) {
                 let Some(after) = rest.strip_prefix(name) else {
                     continue;
@@ -41,7 +41,7 @@ pub fn typeset(text: &str) -> String {
     out
 }
 
-/// Whether a unit may begin behind this character: a number's own may.
+/// Whether a unit may begin after this character: it may directly after a digit.
 fn starts_word(before: Option<char>) -> bool {
     before.is_none_or(|c| !(c.is_alphabetic() || matches!(c, '_' | '-' | '.')))
 }

@@ -1,7 +1,7 @@
-//! A plan against a model and limits, before anything moves.
+//! Checks a plan against a model and limits before anything moves.
 //!
-//! The PZT displacement of a plan comes from the exact inverse of the model's plant under a zero-order hold
-//! (strictly proper form, minimum phase): u_k is solved from y_(k+1). A reserve covers noise, drift and a wrong gain.
+//! The PZT displacement of a plan comes from the exact inverse of the model's plant under a zero-order hold (strictly
+//! proper form, minimum phase): y_(k+1) gives u_k. A reserve covers noise, drift and a wrong gain.
 
 use crate::error::ScriptError;
 use crate::plan::{Motion, Plan, Segment};
@@ -10,7 +10,7 @@ use cellpos_control::Reference;
 use cellpos_numeric::units::Seconds;
 use cellpos_plant::{DiscretePlant, Model, PlantError};
 
-/// What the rig can do.
+/// Capabilities of the rig.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CheckLimits {
     /// Smallest PZT displacement, um.
@@ -44,16 +44,16 @@ impl Default for CheckLimits {
     }
 }
 
-/// Something that the rig cannot do.
+/// A demand that the rig cannot meet.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Violation {
-    /// What is exceeded: `PZT range`, `PZT slew`, `field of view`.
+    /// The exceeded limit: `PZT range`, `PZT slew`, `field of view`.
     pub what: &'static str,
     /// Line of the step in the script.
     pub line: usize,
     /// First time, s (of the plan with its repeats shortened).
     pub time_s: f64,
-    /// What is asked for, in `unit`, at the worst.
+    /// The largest demand, in `unit`.
     pub asked: f64,
     /// What is allowed, in `unit`.
     pub allowed: f64,
@@ -61,7 +61,7 @@ pub struct Violation {
     pub unit: &'static str,
 }
 
-/// A wave, and how large it could be.
+/// A wave and its largest possible amplitude.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WaveCheck {
     /// Line of the step in the script.
@@ -76,12 +76,12 @@ pub struct WaveCheck {
     pub largest_um: f64,
 }
 
-/// How much of a limit a script uses.
+/// The part of a limit that a script uses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LimitUse {
     /// The limit: `PZT range`, `PZT slew`, `field of view`.
     pub what: &'static str,
-    /// Largest share of what is allowed, the reserve taken off; above 1 the script is refused.
+    /// Largest share of the allowed value, after the reserve; above 1 the script is refused.
     pub share: f64,
 }
 
@@ -100,7 +100,7 @@ pub struct Check {
     pub pzt_um: (f64, f64),
     /// Highest speed of the PZT, um/s.
     pub pzt_speed_um_per_s: f64,
-    /// All positions (from the start) times this factor would just be allowed; below 1 the script is refused.
+    /// Largest allowed factor on all positions (from the start); below 1 the script is refused.
     pub largest_factor: f64,
     /// How much of each limit is used.
     pub used: Vec<LimitUse>,
@@ -108,7 +108,7 @@ pub struct Check {
     pub cycles_shown: u64,
     /// Every wave of the script, with the largest amplitude that the rig could do.
     pub waves: Vec<WaveCheck>,
-    /// What the rig cannot do; empty: the script can run.
+    /// Demands that the rig cannot meet; empty: the script can run.
     pub violations: Vec<Violation>,
     /// Times of the reference and PZT demand below, s.
     pub time_s: Vec<f64>,
@@ -130,7 +130,7 @@ pub enum CheckError {
     /// A limit that makes no sense, or a model that cannot be inverted.
     #[error("{0}")]
     Limits(&'static str),
-    /// Too many different steps to go through.
+    /// Too many different steps to check.
     #[error(
         "the steps last {duration_s} s even with repeats shortened; at most {most_s} s can be checked"
     )]
@@ -142,13 +142,13 @@ pub enum CheckError {
     },
 }
 
-/// Longest stretch of holding still that is gone through tick by tick.
+/// Longest hold that is checked tick by tick.
 const MOST_TICKS: f64 = 20e6;
 
 /// Checks a script against a model and limits.
 ///
 /// # Errors
-/// [`CheckError`]; a script that asks too much is no error but has [`Check::violations`].
+/// [`CheckError`]. A script that demands too much is not an error but gives [`Check::violations`].
 pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Check, CheckError> {
     let room_up = (limits.high_um - limits.neutral_um) * (1.0 - limits.reserve);
     let room_down = (limits.neutral_um - limits.low_um) * (1.0 - limits.reserve);
@@ -201,7 +201,7 @@ pub fn check(script: &Script, model: &Model, limits: &CheckLimits) -> Result<Che
     for tick in 0..ticks as u64 {
         let time_s = tick as f64 * h;
         let next_um = plan.at_um(time_s + h);
-        // The answer without a command, then the command that closes the difference.
+        // First the response without a command, then the command that closes the difference.
         let mut free = state.clone();
         plant.step(&mut free, 0.0);
         let u = (next_um - start_um - plant.output_um(&free)) / per_um;
@@ -263,13 +263,13 @@ impl Check {
         else {
             return;
         };
-        // Where it stands takes no PZT: the bead rests anywhere. It does take field of view.
+        // A position needs no PZT displacement, because the bead can rest anywhere. It does need field of view.
         let most_um = (amplitude_um * times).min(view_um - segment.from_um.abs());
         let same = |known: &&mut WaveCheck| {
             (known.line, known.amplitude_um, known.frequency_hz)
                 == (segment.line, amplitude_um, frequency_hz)
         };
-        // The last one added is the one in force, but where steps are repeated.
+        // The last one added is in force, unless steps are repeated.
         match self.waves.iter_mut().rev().find(same) {
             Some(known) => known.largest_um = known.largest_um.min(most_um),
             None => self.waves.push(WaveCheck {
@@ -290,13 +290,13 @@ impl Check {
         }
     }
 
-    /// The limit that a larger script would meet first; none if nothing moves.
+    /// The limit that a larger script would reach first; none if nothing moves.
     pub fn tightest(&self) -> Option<LimitUse> {
         let moved = self.used.iter().filter(|one| one.share > 0.0);
         moved.max_by(|a, b| a.share.total_cmp(&b.share)).copied()
     }
 
-    /// Keeps the worst of each kind at each line.
+    /// Keeps the worst demand of each kind at each line.
     fn violation(&mut self, new: Violation) {
         let known = self
             .violations

@@ -4,14 +4,14 @@ use crate::plan::{Motion, Plan};
 use crate::script::{Condition, OnTimeout};
 use cellpos_control::Reference;
 
-/// What is known of the bead or cell at a tick.
+/// Measurements of the bead or cell at a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Seen {
     /// Measured position, um; None: not seen.
     pub position_um: Option<f64>,
     /// Measured length of the cell, um; None: not seen, or a bead.
     pub length_um: Option<f64>,
-    /// Measured position minus the reference at its exposure, um. None: the present reference counts, which is wrong by the
+    /// Measured position minus the reference at its exposure, um. None: uses the present reference, which is wrong by the
     /// camera's delay while the reference moves.
     pub error_um: Option<f64>,
 }
@@ -51,7 +51,7 @@ pub enum Progress {
 pub struct Output {
     /// Reference, um.
     pub reference_um: f64,
-    /// Time of the plan, s: stands still while waiting.
+    /// Time of the plan, s; it does not advance in a wait.
     pub plan_s: f64,
     /// What is going on.
     pub status: Progress,
@@ -82,8 +82,8 @@ impl Plan {
         self.start_at(0.0)
     }
 
-    /// A cursor at a time of the plan, to resume at a whole cycle. Waits before it count as done, and as having taken no
-    /// time; [`Cursor::expect_elapsed`] has their real time.
+    /// A cursor at a time of the plan, to resume at a whole cycle. Earlier waits count as done in no time;
+    /// [`Cursor::expect_elapsed`] sets their real time.
     pub fn start_at(&self, plan_s: f64) -> Cursor {
         let segment = self.segments().partition_point(|s| s.start_s < plan_s);
         let segment = match self.segments().get(segment.saturating_sub(1)) {
@@ -129,11 +129,11 @@ impl Plan {
         output
     }
 
-    /// A tick in which the plan's clock stands still: running time and stop conditions go on. Allocates nothing.
+    /// A tick in which the plan's clock does not advance, but running time and stop conditions do. Allocates nothing.
     pub fn stand(&self, cursor: &mut Cursor, sample_s: f64, seen: &Seen) -> Output {
         if !matches!(cursor.status, Progress::Done | Progress::Stopped(_)) {
             let blind = Seen {
-                // A bead that is being held is not tracked: its distance from the reference is no error.
+                // A frozen bead does not follow the reference, so its distance from the reference is not an error.
                 error_um: seen.position_um.map(|_| 0.0),
                 ..*seen
             };
@@ -150,8 +150,7 @@ impl Plan {
         }
     }
 
-    /// The reference of the ticks to come, the next one first, as far as it is known: from the next wait on it stays.
-    /// Allocates nothing.
+    /// The known reference of future ticks, the next one first; constant from the next wait on. Allocates nothing.
     pub fn preview(&self, cursor: &Cursor, sample_s: f64, preview_um: &mut [f64]) {
         if cursor.status != Progress::Running {
             preview_um.fill(self.reference_um(cursor));
@@ -285,7 +284,7 @@ impl Plan {
 }
 
 impl Cursor {
-    /// Counts changes of the cell's length from this one; None: from the first that is seen.
+    /// Sets the length from which changes of the cell count; None: the first measured length.
     pub fn expect_length(&mut self, length_um: Option<f64>) {
         self.first_length_um = length_um;
     }

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-/// A script that cannot be used: where, what is wrong, what would be right.
+/// A script that cannot be used: position, error, and what would be right.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{file}:{line}:{column}: {message}{}", help.as_ref().map(|help| format!("; {help}")).unwrap_or_default())]
 pub struct ScriptError {

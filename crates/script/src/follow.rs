@@ -7,14 +7,14 @@ use std::sync::Arc;
 
 /// References kept, to compare a position with the reference of the time at which it was measured.
 const PAST: usize = 64;
-/// Ticks that the end of a script is held, so that the positions of its last cycle still arrive.
+/// Ticks of hold at the end of a script, so that the positions of its last cycle still arrive.
 const TAIL_TICKS: u32 = 25;
 
-/// Walks a loop through a plan.
+/// Leads a loop through a plan.
 ///
-/// Before the plan's clock starts, and after a skipped step, the bead moves to the place where the plan begins or continues
-/// (minimum jerk, at most [`Follower::APPROACH_UM_PER_S`]) and settles there. While the bead is
-/// frozen the plan's clock stands still, so that no cycle is lost to a pause; running time and stop conditions go on.
+/// Before the plan's clock starts, and after a skipped step, the bead moves to the plan's position and settles there (minimum
+/// jerk, at most [`Follower::APPROACH_UM_PER_S`]). While the bead is frozen the plan's clock stops, so that a pause costs no
+/// cycle. Running time and stop conditions continue.
 #[derive(Debug, Clone)]
 pub struct Follower {
     plan: Arc<Plan>,
@@ -31,7 +31,7 @@ pub struct Follower {
     tail: u32,
 }
 
-/// Where the way to the plan's next position stands.
+/// Progress of the approach to the plan's next position.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Approach {
     /// Waiting for the first position.
@@ -108,7 +108,7 @@ impl Follower {
         }
     }
 
-    /// One tick of the way to the plan's position; None: it is over.
+    /// One tick of the approach to the plan's position; None: it is over.
     fn approach(&mut self, input: &ReferenceInput) -> Option<f64> {
         let to_um = self.plan.reference_um(&self.cursor);
         if self.approach == Approach::Due {
@@ -282,7 +282,7 @@ mod tests {
         }
     }
 
-    /// Runs to the end with a bead that is always where it should be; gives (reference, stage, plan) of each tick.
+    /// Runs to the end with a bead that is always at the reference; returns (reference, stage, plan) of each tick.
     fn walk(
         follower: &mut Follower,
         change: impl Fn(usize, &mut ReferenceInput),

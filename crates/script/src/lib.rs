@@ -1,12 +1,12 @@
 //! Setpoint scripts: the motion of the bead or cell, as a TOML file with units.
 //!
-//! [`Script`] is the file, read with errors that name line and column. [`Plan`] is the script laid out in time: it
-//! gives the reference at any instant without allocation (it is a [`cellpos_control::Reference`]), and the cycles. A
-//! [`Cursor`] walks through it, waits for conditions and ends on stop conditions. [`check()`] compares a plan with a model and limits before
-//! anything moves: peak position, speed and PZT demand, and the largest amplitude that the rig could do.
+//! A [`Script`] is the file; errors of reading name line and column. A [`Plan`] is the script laid out in time. It gives the cycles, and
+//! the reference at any instant without allocation (it is a [`cellpos_control::Reference`]). A [`Cursor`] steps through the plan, waits
+//! for conditions and ends on stop conditions. Before anything moves, [`check()`] compares a plan with a model and limits: peak position,
+//! speed and PZT demand, and the largest possible amplitude.
 //!
-//! The format is described in `docs/scripts.md`. [`Follower`] makes it the reference generator of a loop, [`CycleTable`]
-//! makes a row for each of its cycles from the loop's records. Not here: the loop, devices, files of a run.
+//! The format is described in `docs/scripts.md`. A [`Follower`] makes it the reference generator of a loop. A [`CycleTable`] makes a row
+//! for each cycle from the loop's records. Not here: the loop, devices, files of a run.
 //!
 //! ```
 //! use cellpos_script::{Plan, Script};

@@ -54,7 +54,7 @@ pub(crate) struct Node<'a> {
     pub(crate) source: Source<'a>,
     pub(crate) table: &'a DeTable<'a>,
     pub(crate) span: (usize, usize),
-    /// Values that stand for `"$name"`: name and text, innermost last.
+    /// Values that replace `"$name"`: name and text, innermost last.
     pub(crate) variables: &'a [(String, String)],
 }
 
@@ -92,7 +92,7 @@ impl<'a> Node<'a> {
         self.table.get(key)
     }
 
-    /// Where a key's value stands, or the table if it is absent.
+    /// Position of a key's value, or of the table if the key is absent.
     pub(crate) fn span_of(&self, key: &str) -> Range<usize> {
         self.raw(key).map_or_else(|| self.span(), Spanned::span)
     }

@@ -105,7 +105,7 @@ impl Script {
     }
 }
 
-/// What reading a file carries along.
+/// The context of reading a file.
 struct Reader<'l> {
     load: &'l dyn Fn(&str) -> Result<String, String>,
     seed: u64,

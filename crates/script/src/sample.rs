@@ -1,12 +1,12 @@
-//! What was in the channel: the table `[sample]` of rig.toml and of scripts.
+//! The table `[sample]` of rig.toml and of scripts: contents of the channel.
 
 use serde::{Deserialize, Serialize};
 
-/// Sample, medium and chip of a run, as reports show them and formats of the field ask for them. Everything may be left out.
+/// Sample, medium and chip of a run, for reports and for the field's file formats. Every key may be left out.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Sample {
-    /// What is in the channel: cells and their source, beads and their diameter.
+    /// Contents of the channel: cells and their source, beads and their diameter.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sample: Option<String>,
     /// What it swims in.
@@ -49,7 +49,7 @@ impl Sample {
         }
     }
 
-    /// Names and values of what is said.
+    /// Names and values of the keys that are set.
     pub fn rows(&self) -> Vec<(&'static str, String)> {
         let number = |value: Option<f64>, unit: &str| value.map(|value| format!("{value} {unit}"));
         [

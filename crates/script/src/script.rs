@@ -3,7 +3,7 @@
 use crate::sample::Sample;
 use std::ops::Range;
 
-/// How a move gets from one position to the other.
+/// Profile of a move from one position to another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MoveShape {
     /// Constant velocity.
@@ -26,7 +26,7 @@ pub enum WaveShape {
 }
 
 impl WaveShape {
-    /// As it is written in a script.
+    /// Its name in a script.
     pub fn name(self) -> &'static str {
         match self {
             Self::Sine => "sine",
@@ -36,7 +36,7 @@ impl WaveShape {
     }
 }
 
-/// What a wait waits for.
+/// The condition of a wait.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Condition {
     /// The error stays within a band for a time.
@@ -62,7 +62,7 @@ pub enum Condition {
     },
 }
 
-/// What happens when a wait takes too long.
+/// The action if a wait takes too long.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnTimeout {
     /// The script stops.
@@ -102,7 +102,7 @@ pub struct Stop {
     /// Tracking error above this, um.
     pub error_above_um: Option<f64>,
     /// Mean amplitude error of ten cycles above this, as a share of the commanded amplitude. Judged on the rows of the
-    /// per-cycle table, so not by a [`crate::Cursor`] but by whoever keeps the table, see [`crate::AmplitudeWatch`].
+    /// per-cycle table by [`crate::AmplitudeWatch`], not by a [`crate::Cursor`].
     pub amplitude_error_above: Option<f64>,
     /// Length of the cell changed by more than this since the first frame, um.
     pub length_change_above_um: Option<f64>,
@@ -119,7 +119,7 @@ pub struct Stop {
     pub after_cycles: Option<u64>,
 }
 
-/// Which clips of the camera's picture are to be kept.
+/// The clips of the camera's picture to keep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ClipWishes {
     /// Cycles, from 1.
@@ -132,7 +132,7 @@ pub struct ClipWishes {
     pub after_s: f64,
     /// Largest size of all clips together, MB.
     pub most_mb: u64,
-    /// Whether what happens (the bead lost, a freeze, Safe) is kept too.
+    /// Whether to keep clips of events too (bead lost, freeze, Safe).
     pub events: bool,
 }
 
@@ -161,7 +161,7 @@ pub struct Step {
     pub(crate) span: Range<usize>,
 }
 
-/// What a step does. Positions are of the bead, um; each step starts where the one before ended.
+/// The action of a step. Positions are those of the bead, um; each step starts at the end of the step before.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StepKind {
     /// Stay.

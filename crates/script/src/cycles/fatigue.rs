@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 /// A limit that the cell has passed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FatigueStop {
-    /// Which quantity, as the script's key names it.
+    /// The quantity, by its key in the script.
     pub quantity: &'static str,
     /// Its mean over the last ten cycles.
     pub value: f64,
@@ -51,7 +51,7 @@ impl Ends {
     }
 }
 
-/// Watches the cell over its cycles. Feed it the rows in order, those of earlier sessions of the run too.
+/// Watches the cell over its cycles. Feed it the rows in order, including those of earlier sessions of the run.
 #[derive(Debug, Clone)]
 pub struct FatigueWatch {
     stop: Stop,
@@ -63,10 +63,10 @@ pub struct FatigueWatch {
 }
 
 impl FatigueWatch {
-    /// Cycles of which the mean is judged.
+    /// Number of cycles in a mean.
     pub const WINDOW: usize = 10;
 
-    /// A watch; None where the script has no such stop.
+    /// A watch; None if the script has no such stop.
     pub fn new(stop: &Stop) -> Option<Self> {
         let any = stop.stretch_down.is_some()
             || stop.rest_length_change.is_some()
@@ -81,8 +81,8 @@ impl FatigueWatch {
         })
     }
 
-    /// Takes a row; gives the first limit that is passed. Rows of the static arm, of ramps and of disturbed cycles do not
-    /// count; another motion restarts the count.
+    /// Takes a row; returns the first limit that is passed. Rows of the static arm, of ramps and of disturbed cycles do not
+    /// count. Another motion restarts the count.
     pub fn add(&mut self, row: &CycleRow) -> Option<FatigueStop> {
         self.at_rest.take(row);
         if row.arm != ArmKind::Cyclic || row.flags.is_disturbed() || row.flags.has(CycleFlags::RAMP)

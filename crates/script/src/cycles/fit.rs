@@ -23,9 +23,9 @@ pub(super) struct Sines {
     pub(super) commanded: f64,
     /// Amplitude of the reached signal.
     pub(super) reached: f64,
-    /// By how much the reached signal lags, degrees of a cycle.
+    /// Lag of the reached signal, degrees of a cycle.
     pub(super) lag_deg: f64,
-    /// Slope of reached less commanded over the whole cycle.
+    /// Slope of reached minus commanded over the whole cycle.
     pub(super) slope_per_cycle: f64,
 }
 
@@ -40,7 +40,7 @@ impl SineFit {
         self.reached += basis * reached;
     }
 
-    /// The fit; None with so few samples, or so badly spread, that it would say nothing.
+    /// The fit; None if the samples are too few or too badly spread.
     pub(super) fn solve(&self) -> Option<Sines> {
         if self.samples < 6 {
             return None;
@@ -50,8 +50,8 @@ impl SineFit {
         if scaled.determinant() < 1e-4 {
             return None;
         }
-        // The reference is periodic and known: no slope in it, or the corners of a triangle would be taken for one. The
-        // error, which drift is part of, is fitted with the slope, and added.
+        // Fit the reference, which is periodic and known, without a slope: the corners of a triangle would look like one. Fit the
+        // error, which contains the drift, with a slope, and add it.
         let pick = [0, 2, 3];
         let periodic = Matrix3::from_fn(|i, j| scaled[(pick[i], pick[j])]);
         let rhs = self.commanded / self.samples as f64;

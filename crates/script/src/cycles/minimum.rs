@@ -1,7 +1,7 @@
 //! The minimum of a cost over one number.
 
-/// Where a cost with one minimum but flat ends is least between `low` and `high`: looked at in `looks` equal steps, then
-/// `rounds` golden sections about the best. None if it is least at an end: the minimum is outside.
+/// Minimum between `low` and `high` of a cost with one minimum but flat ends: `looks` equal steps, then `rounds` golden sections
+/// about the best. None if an end is the smallest: the minimum is then outside.
 pub(super) fn minimum(
     low: f64,
     high: f64,

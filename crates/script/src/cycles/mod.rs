@@ -1,8 +1,7 @@
-//! The per-cycle table: one row for each cycle of a plan, from the loop's records as they go by.
+//! The per-cycle table: one row for each cycle of a plan, made from the loop's records during the run.
 //!
-//! Every cycle of the plan gets exactly one row, in order, once it is over. A cycle that was skipped, or whose records were all
-//! lost, has a row with a flag and without figures. A cycle that was not brought to its end has no
-//! row, so that a run that is resumed does it again.
+//! Every cycle of the plan gets exactly one row, in order, when it is over. A skipped cycle, or one whose records were all lost,
+//! has a row with a flag and no figures. An unfinished cycle has no row, so that a resumed run repeats it.
 
 mod fatigue;
 mod fit;
@@ -34,7 +33,7 @@ use resting::{Rest, Resting};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Ticks remembered, to find what was commanded when a position was exposed.
+/// Ticks kept, to find the command at the exposure of a position.
 const PAST: usize = 128;
 
 /// Makes rows from records.
@@ -47,7 +46,7 @@ pub struct CycleTable {
     past: VecDeque<Past>,
     next: u64,
     open: Option<Open>,
-    /// What happened since the last row and belongs to the next.
+    /// Events since the last row, which belong to the next one.
     pending: CycleFlags,
     ready: VecDeque<CycleRow>,
     last_seq: Option<u64>,
@@ -57,7 +56,7 @@ pub struct CycleTable {
     resting: Resting,
 }
 
-/// What the loop did at a tick.
+/// State of the loop at a tick.
 #[derive(Debug, Clone, Copy)]
 struct Past {
     time_ns: i64,
@@ -95,7 +94,7 @@ impl CycleTable {
         }
     }
 
-    /// The cycle that is going on or comes next.
+    /// The running cycle or the next one.
     pub fn current(&self) -> u64 {
         self.next
     }
@@ -149,7 +148,7 @@ impl CycleTable {
         } else {
             record.time_ns - self.delay_ns
         };
-        // What was exposed before the first tick of the script belongs to no cycle.
+        // Positions exposed before the first tick of the script belong to no cycle.
         let Some(place) = self.place(exposed_ns, fresh) else {
             return;
         };
@@ -165,12 +164,12 @@ impl CycleTable {
         }
     }
 
-    /// Where the plan stood at a time.
+    /// The plan's time at a time of the run.
     fn place(&self, time_ns: i64, fresh: bool) -> Option<Place> {
         let index = self.past.partition_point(|past| past.time_ns <= time_ns);
         let before = self.past.get(index.checked_sub(1)?)?;
-        // Between two ticks the plan's clock ran on only if it did so by no more than they are apart: a skipped step is
-        // a jump, a wait stands still.
+        // The plan's clock ran between two ticks if it advanced by no more than their distance. A larger advance is a skipped
+        // step; no advance is a wait.
         let after = self.past.get(index).filter(|after| {
             before.stage == Stage::Running
                 && after.plan_ns - before.plan_ns <= (after.time_ns - before.time_ns) * 3 / 2
@@ -202,7 +201,7 @@ impl CycleTable {
             if end_ns > plan_ns {
                 return;
             }
-            // Also of a cycle that continued after the skipped step: it differs from the script.
+            // This includes a cycle that continued after the skipped step: it differs from the script.
             let skipped = self
                 .skips_ns
                 .iter()
@@ -228,7 +227,7 @@ impl CycleTable {
             row.flags.judge(worst);
             self.ready.push_back(row);
             self.next += 1;
-            // A gap disturbs every cycle that it touches, the one that it ends in included.
+            // A gap disturbs every cycle that it touches, including the one in which it ends.
             let reaches_on = self
                 .plan
                 .cycle(self.next)

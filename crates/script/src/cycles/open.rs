@@ -1,4 +1,4 @@
-//! A cycle that is going on.
+//! The running cycle.
 
 use super::fit::SineFit;
 use super::place::{Place, bounds_ns};
@@ -30,7 +30,7 @@ pub(super) struct Open {
     dwells: bool,
     lengths_um: Series,
     areas_um2: Series,
-    /// Where the reference is at the start, um, and the rest of the cell there.
+    /// Reference at the start, um, and the rest of the cell there.
     start_um: f64,
     rest: Option<Rest>,
     /// Ticks whose command was late or was not the controller's own, and ticks whose position was refused.
@@ -84,7 +84,7 @@ impl Open {
         self.last_seen.map(|last| last.0)
     }
 
-    /// A rest is over: that before the cycle, if it was where the cycle begins.
+    /// Takes a rest that is over: the one before the cycle, if it was at the cycle's first position.
     pub(super) fn begins_after(&mut self, rest: Option<Rest>) {
         if self.rest.is_none() {
             self.rest = rest.filter(|rest| rest.was_at(self.start_um));
@@ -111,7 +111,7 @@ impl Open {
             self.row.dwell_s += period_s;
         }
         if place.stage == Stage::Paused {
-            // Time continues and the cycle does not.
+            // Time continues but the cycle does not.
             self.last_seen = None;
         } else if good {
             self.position(record, place, phase, flow_um, period_s);
@@ -121,7 +121,7 @@ impl Open {
     fn count(&mut self, record: &TickRecord, place: &Place) {
         let row = &mut self.row;
         let has = |mask| record.flags.has(mask);
-        // Between two frames of a slower camera nothing was to come.
+        // No frame was due between two frames of a slower camera.
         let lost = has(TickFlags::LOST) || !(place.fresh || has(TickFlags::BETWEEN));
         let limited = has(TickFlags::RANGE_LIMITED) || has(TickFlags::SLEW_LIMITED);
         let late = has(TickFlags::LATE) || has(TickFlags::ACTUATOR_RING_FULL);
@@ -174,7 +174,7 @@ impl Open {
         self.error_um += error_um;
         self.error_um2 += error_um * error_um;
         self.row.peak_um = self.row.peak_um.max(error_um.abs());
-        // In a wait the phase stands still: its samples would only pull on one point of the fit.
+        // In a wait the phase is constant: its samples would all weigh on one point of the fit.
         if place.stage == Stage::Running {
             self.fit.add(phase, place.target_um, at_um);
         }
@@ -198,7 +198,7 @@ impl Open {
     /// The row of the finished cycle, and the largest share of its `expected` ticks that one kind of trouble touched. `resting`:
     /// the remaining rest.
     pub(super) fn finish(mut self, expected: f64, resting: Option<Rest>) -> (CycleRow, f64) {
-        // A cycle that never left its start is a rest as a whole.
+        // A cycle that never left its start is a rest.
         self.begins_after(resting.filter(|_| self.row.stroke_um == 0.0));
         let mut row = self.row;
         if let Some(rest) = self.rest {
@@ -227,7 +227,7 @@ impl Open {
         }
         if let Some(sines) = self.fit.solve() {
             row.drift_um_per_s = sines.slope_per_cycle / row.duration_s;
-            // A reference that stands still has no amplitude to be reached, and no phase.
+            // A constant reference has neither amplitude nor phase.
             if sines.commanded > 1e-6 {
                 row.commanded_um = sines.commanded;
                 row.reached_um = sines.reached;
@@ -239,7 +239,7 @@ impl Open {
         }
         let [n, u, v, uu, uv] = self.gain;
         let spread = uu - u * u / n.max(1.0);
-        // A command that hardly moves says nothing about the gain: 0.02 um RMS is 8 um/s of bead.
+        // A command that hardly moves does not determine the gain: 0.02 um RMS is 8 um/s of bead.
         if n >= 10.0 && spread / n > 4e-4 {
             row.gain_per_s = (uv - u * v / n) / spread;
         }
@@ -250,8 +250,8 @@ impl Open {
         row.length_three_quarters_um = length_um.three_quarters;
         row.length_peak_um = length_um.peak;
         row.length_end_um = length_um.end;
-        // Of the length: the area follows it, but with a power below one, so that its relaxation is no single exponential.
-        // A cell that rests under its load does not recover, whatever its noise looks like.
+        // From the length, not the area: the area follows the length with a power below one, so its relaxation is not a single
+        // exponential. A cell at rest under load does not recover, even if its noise looks like it.
         if row.stroke_um > STILL_UM {
             row.recovery_s = self.lengths_um.recovery_s();
         }

@@ -1,4 +1,4 @@
-//! Cycles that went otherwise than those before them, although nobody reported anything.
+//! Cycles that differ from the cycles before them without any reported event.
 
 use super::CycleRow;
 use std::collections::VecDeque;
@@ -10,17 +10,17 @@ pub(super) struct Outliers {
     rms_um: VecDeque<f64>,
 }
 
-/// Cycles that are compared with.
+/// Number of cycles for comparison.
 const KEPT: usize = 21;
 /// Smallest number.
 const FEWEST: usize = 5;
-/// An error this many times their median is another one.
+/// An error this many times their median is an outlier.
 const TIMES: f64 = 3.0;
-/// Smaller errors are nobody's, um: a bead's own wandering varies by that much from cycle to cycle.
+/// Smaller errors never count, um: a bead's Brownian motion varies by this much from cycle to cycle.
 const SMALL_UM: f64 = 0.15;
 
 impl Outliers {
-    /// Whether a finished cycle is an outlier; an undisturbed one that is not is remembered.
+    /// Whether a finished cycle is an outlier. Remembers it if it is undisturbed and not an outlier.
     pub(super) fn is_one(&mut self, row: &CycleRow) -> bool {
         if !self.motion.is_some_and(|motion| row.moves_as(motion)) {
             self.motion = Some((row.stroke_um, row.duration_s));

@@ -1,4 +1,4 @@
-//! Where in the plan a frame falls, and where a cycle begins and ends.
+//! Places in the plan: of a frame, and of a cycle's begin and end.
 
 use crate::plan::Cycle;
 use cellpos_runtime::Stage;

@@ -2,15 +2,15 @@
 
 use super::CycleRow;
 
-/// Length and area of the cell at rest before the first cycle of a run that has them: means over the rest, with their uncertainty. Of
-/// a table that an older version wrote: at the start of the first cycle, known to nobody knows what.
+/// Length and area of the cell at rest before the first cycle of a run that has them: means over the rest, with their uncertainty. For a
+/// table of an older version: the values at the start of the first cycle, with unknown uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtRest {
-    /// Length, um; NaN where it was not measured.
+    /// Length, um; NaN if not measured.
     pub length_um: f64,
     /// Its standard deviation, um; NaN if unknown.
     pub length_sd_um: f64,
-    /// Projected area, um^2; NaN where it was not measured.
+    /// Projected area, um^2; NaN if not measured.
     pub area_um2: f64,
     /// Its standard deviation, um^2; NaN if unknown.
     pub area_sd_um2: f64,
@@ -28,7 +28,7 @@ impl Default for AtRest {
 }
 
 impl AtRest {
-    /// Of all rows of a run, in order, those of earlier sessions first.
+    /// From all rows of a run, in order, those of earlier sessions first.
     pub fn of<'r>(rows: impl IntoIterator<Item = &'r CycleRow>) -> Self {
         let mut rest = Self::default();
         rows.into_iter().for_each(|row| rest.take(row));

@@ -12,7 +12,7 @@ const MOST: usize = 4000;
 /// Blocks whose scatter gives the uncertainty of a mean: errors of neighbouring frames (focus, light, outline) are correlated.
 const BLOCKS: usize = 10;
 
-/// A mean and its standard deviation; NaN where nothing was measured.
+/// A mean and its standard deviation; NaN if nothing was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MeanSd {
     pub(super) mean: f64,
@@ -34,7 +34,7 @@ impl Rest {
     }
 }
 
-/// What is measured at the place where the reference is.
+/// The measurements at the reference's present place.
 #[derive(Debug, Default)]
 pub(super) struct Resting {
     at_um: Option<f64>,
@@ -43,7 +43,7 @@ pub(super) struct Resting {
 }
 
 impl Resting {
-    /// Takes a frame with the reference at its exposure; gives the rest that is over when the reference has left its place.
+    /// Takes a frame with the reference at its exposure. If the reference has left its place, returns the rest that is over.
     pub(super) fn add(&mut self, record: &TickRecord, target_um: f64) -> Option<Rest> {
         let same = |at: f64| (target_um - at).abs() <= SAME_PLACE_UM;
         let over = match self.at_um {

@@ -2,7 +2,7 @@
 
 use crate::plan::ArmKind;
 
-/// What disturbed a cycle, as bits.
+/// The disturbances of a cycle, as bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct CycleFlags(pub u32);
 
@@ -56,28 +56,27 @@ impl CycleFlags {
     pub const GATED: u32 = 1 << 11;
     /// Safe was latched.
     pub const SAFE: u32 = 1 << 12;
-    /// A wait of the script fell into it (no disturbance, but it took longer).
+    /// It contains a wait of the script (not a disturbance, but it took longer).
     pub const WAITED: u32 = 1 << 13;
 
     /// The operator paused it.
     pub const PAUSED: u32 = 1 << 14;
     /// The bead stuck to a wall.
     pub const STUCK: u32 = 1 << 15;
-    /// The error is far from that of the undisturbed cycles before of the same stroke and duration: something went wrong
-    /// that nobody reported.
+    /// The error differs much from that of earlier undisturbed cycles with the same stroke and duration: an unreported fault.
     pub const OUTLIER: u32 = 1 << 16;
 
-    /// The amplitude of the script's own wave grew or fell over it (no disturbance, but another motion than full swing).
+    /// The amplitude of the script's own wave grew or fell in it (not a disturbance, but not the motion at full amplitude).
     pub const RAMP: u32 = 1 << 17;
-    /// What happened changed the cycle: see [`CycleFlags::is_disturbed`].
+    /// An event changed the cycle: see [`CycleFlags::is_disturbed`].
     pub const DISTURBED: u32 = 1 << 18;
 
-    /// What changes a cycle however short it lasts: it was not the motion of the script, or not that of the bead.
+    /// Events of any duration that change a cycle: the motion was not that of the script, or not that of the bead.
     const GRAVE: u32 =
         Self::FROZEN | Self::SKIPPED | Self::SAFE | Self::PAUSED | Self::STUCK | Self::OUTLIER;
 
-    /// Share of a cycle's ticks from which one kind of trouble counts as a disturbance. The prediction bridges a frame that is
-    /// lost now and then, which changes a cycle's figures by less than Brownian motion does.
+    /// Share of a cycle's ticks from which one kind of trouble counts as a disturbance. The prediction bridges an occasional lost
+    /// frame, which changes a cycle's figures by less than Brownian motion does.
     pub const WORTH_COUNTING: f64 = 0.02;
 
     /// Whether all bits of `mask` are set.
@@ -91,18 +90,18 @@ impl CycleFlags {
         }
     }
 
-    /// Whether what happened changed the cycle: it was frozen, paused, skipped, in Safe, stuck or an outlier, or one kind of
-    /// trouble touched a fiftieth of its ticks ([`Self::WORTH_COUNTING`]).
+    /// Whether events changed the cycle: frozen, paused, skipped, in Safe, stuck, an outlier, or one kind of trouble in a
+    /// fiftieth of its ticks ([`Self::WORTH_COUNTING`]).
     pub fn is_disturbed(self) -> bool {
         self.0 & (Self::DISTURBED | Self::GRAVE) != 0
     }
 
-    /// Whether anything at all happened in the cycle that should not have.
+    /// Whether the cycle has any unwanted event.
     pub fn is_touched(self) -> bool {
         self.0 & !(Self::WAITED | Self::RAMP) != 0
     }
 
-    /// Says whether the cycle is disturbed. `worst`: the largest share of its ticks that one kind of trouble touched.
+    /// Sets whether the cycle is disturbed. `worst`: the largest share of its ticks with one kind of trouble.
     pub(super) fn judge(&mut self, worst: f64) {
         self.set(
             Self::DISTURBED,
@@ -141,10 +140,9 @@ impl std::str::FromStr for CycleFlags {
     }
 }
 
-/// One cycle as it went. A number that does not exist is NaN, and an empty cell in the table.
+/// The figures of one cycle. A missing number is NaN, and an empty cell in the table.
 ///
-/// Positions count at the time of their exposure, against the reference of that time: the camera's delay is in the
-/// loop, not in these figures.
+/// Each position is compared with the reference at its exposure, so the camera's delay is not in these figures.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CycleRow {
     /// Number, from 0 through the whole script.
@@ -161,7 +159,7 @@ pub struct CycleRow {
     pub duration_s: f64,
     /// Its recorded ticks.
     pub ticks: u64,
-    /// Of these: with a position that counts.
+    /// Ticks with a valid position.
     pub seen: u64,
     /// Frames without a valid position, and ticks without a frame.
     pub lost: u64,
@@ -179,15 +177,15 @@ pub struct CycleRow {
     pub commanded_um: f64,
     /// Reached amplitude at the cycle's frequency, um.
     pub reached_um: f64,
-    /// By how much the bead lags behind the reference, degrees of a cycle.
+    /// Lag of the bead behind the reference, degrees of a cycle.
     pub lag_deg: f64,
-    /// Mean of position less reference, um.
+    /// Mean of position minus reference, um.
     pub bias_um: f64,
-    /// RMS of position less reference, um.
+    /// RMS of position minus reference, um.
     pub rms_um: f64,
     /// Largest distance of position from reference, um.
     pub peak_um: f64,
-    /// Change of position less reference over the cycle per time, um/s.
+    /// Change of position minus reference over the cycle per time, um/s.
     pub drift_um_per_s: f64,
     /// Mean of the estimated displacement at which the bead rests, um.
     pub neutral_um: f64,
@@ -221,7 +219,7 @@ pub struct CycleRow {
     pub area_peak_um2: f64,
     /// Projected area of the cell at the end, um^2.
     pub area_end_um2: f64,
-    /// Mean length of the cell at rest where the cycle begins, before it left there, um.
+    /// Mean length of the cell at rest at the cycle's first position, before the cycle, um.
     pub length_rest_um: f64,
     /// Standard deviation of that mean, um.
     pub length_rest_sd_um: f64,
@@ -293,7 +291,7 @@ floats!(
 );
 
 impl CycleRow {
-    /// Error over cycles, um RMS; `None` where none of them has one.
+    /// Error over cycles, um RMS; `None` if no cycle has one.
     pub fn rms_over_um(rows: &[Self]) -> Option<f64> {
         let squares = rows.iter().map(|row| row.rms_um * row.rms_um);
         let (count, sum) = squares
@@ -356,8 +354,8 @@ impl CycleRow {
         row
     }
 
-    /// Whether stroke (um) and duration (s) are those of another cycle's motion, to a hundredth: they are computed from places
-    /// in the plan, and differ by rounding from cycle to cycle.
+    /// Whether stroke (um) and duration (s) equal those of another cycle's motion to a hundredth. Both come from places in the
+    /// plan, so rounding differs from cycle to cycle.
     pub fn moves_as(&self, (stroke_um, duration_s): (f64, f64)) -> bool {
         let same = |a: f64, b: f64| (a - b).abs() <= 1e-2 * a.abs().max(b.abs()).max(1e-6);
         same(self.stroke_um, stroke_um) && same(self.duration_s, duration_s)

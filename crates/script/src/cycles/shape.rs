@@ -1,4 +1,4 @@
-//! What the shape of a cell, its length or its projected area, does over a cycle.
+//! Length or projected area of a cell over a cycle.
 
 use super::fit;
 
@@ -15,7 +15,7 @@ struct Point {
     value: f64,
 }
 
-/// A quantity at fixed phases of the cycle; NaN where it was not measured.
+/// A quantity at fixed phases of the cycle; NaN if not measured.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AtPhases {
     pub(super) start: f64,
@@ -27,7 +27,7 @@ pub(super) struct AtPhases {
 }
 
 impl Series {
-    /// Takes a value exposed at a time and phase (in cycles); one that is not finite was not measured.
+    /// Takes a value exposed at a time and phase (in cycles). A value that is not finite counts as not measured.
     pub(super) fn add(&mut self, time_s: f64, phase: f64, value: f64) {
         if value.is_finite() {
             self.points.push(Point {
@@ -59,7 +59,7 @@ impl Series {
         largest.map(|(index, _)| index)
     }
 
-    /// The value at a phase, on the line between its neighbours; NaN where none was measured for a tenth of the cycle.
+    /// The value at a phase, interpolated between its neighbours; NaN in a gap of a tenth of the cycle.
     fn at(&self, phase: f64) -> f64 {
         let after = self.points.partition_point(|point| point.phase < phase);
         let before = after
@@ -81,11 +81,11 @@ impl Series {
         };
         let after = self.points.get(index..).unwrap_or(&[]);
         let peak = after.first().map_or(f64::NAN, |point| point.value);
-        // Noise alone must not be taken for a recovery.
+        // Noise alone must not count as a recovery.
         if peak - last.value < 0.05 * peak {
             return f64::NAN;
         }
-        // From nine tenths of the way down on: the way out of the constriction itself is no relaxation.
+        // Fit from nine tenths of the height down: leaving the constriction is not relaxation.
         let level = last.value + 0.9 * (peak - last.value);
         let falling: Vec<(f64, f64)> = after
             .iter()

@@ -1,10 +1,10 @@
-//! The per-cycle table read back, also one that an older version wrote.
+//! Reads the per-cycle table back, also one that an older version wrote.
 
 use super::CycleRow;
 use super::row::{FLOATS, WHOLES};
 use crate::plan::ArmKind;
 
-/// Columns that older versions did not write; of their cycles they are not known.
+/// Columns that older versions did not write; unknown for their cycles.
 const LATER: [&str; 10] = [
     "area_start_um2",
     "area_quarter_um2",
@@ -45,7 +45,7 @@ enum Column {
 }
 
 impl CycleColumns {
-    /// The columns that a head names. Those that older versions did not have may be missing.
+    /// The columns that a head names. Columns that older versions did not have may be missing.
     ///
     /// # Errors
     /// [`HeadError`] names the column.
@@ -110,17 +110,17 @@ impl CycleColumns {
 pub struct ReadCycles {
     /// Its rows.
     pub rows: Vec<CycleRow>,
-    /// Lines after the header that are not rows; all of them after a wrong header.
+    /// Lines after the header that are not rows; after a wrong header, every line.
     pub unreadable: usize,
-    /// What is wrong with the head.
+    /// The error of the head.
     pub head: Option<HeadError>,
     /// Whether an older version wrote it, without some of the columns of this one.
     pub older: bool,
 }
 
-/// Reads a per-cycle table; a last line without its end was cut off, and is no row.
+/// Reads a per-cycle table. A last line without a line end was cut off and is not a row.
 pub fn read_cycles(text: &str) -> ReadCycles {
-    // It may read as a row and still not be the one that was meant.
+    // It may parse as a row and still differ from the intended one.
     let whole = text.rfind('\n').map_or(0, |end| end + 1);
     let mut read = ReadCycles {
         rows: Vec::new(),

@@ -15,7 +15,7 @@ pub struct Mean {
     pub ci95: f64,
 }
 
-/// What a quantity does over the cycles.
+/// The trend of a quantity over the cycles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trend {
     /// Cycles with a value.
@@ -30,13 +30,13 @@ pub struct Trend {
     pub ci95_per_cycle: f64,
     /// RMS of the residual of the straight line.
     pub residual: f64,
-    /// The law that saturates, where the cycles say at what.
+    /// The law that saturates, if the cycles determine its end.
     pub saturating: Option<Saturating>,
 }
 
 impl Trend {
-    /// Whether the change is beyond chance: outside three times its 95 % interval. Then slightly correlated residuals cause
-    /// hardly a false alarm in a thousand static arms.
+    /// Whether the change is significant: outside three times its 95 % interval. With this limit, slightly correlated residuals
+    /// cause hardly one false alarm in a thousand static arms.
     pub fn is_significant(&self) -> bool {
         self.per_cycle.abs() > 3.0 * self.ci95_per_cycle
     }
@@ -55,8 +55,8 @@ pub fn student95(freedom: usize) -> f64 {
 }
 
 impl Mean {
-    /// Of `(cycle, value)` points, at least one. A steady change within them is no scatter: the interval is of the scatter about
-    /// their straight line. Three points say too little about a line: of them it is the scatter about the mean.
+    /// From `(cycle, value)` points, at least one. A steady change is not scatter, so the interval uses the scatter about a
+    /// straight line. Three points hardly determine a line, so it then uses the scatter about the mean.
     pub fn of(points: &[(f64, f64)]) -> Self {
         let n = points.len() as f64;
         let mean = points.iter().map(|p| p.1).sum::<f64>() / n;
@@ -127,7 +127,7 @@ pub enum Alarm {
         /// Its change per cycle.
         per_cycle: f64,
     },
-    /// It is back below two thirds of the limit.
+    /// It has fallen below two thirds of the limit.
     Cleared {
         /// Mean error over the window.
         error: f64,
@@ -151,7 +151,7 @@ pub struct AmplitudeWatch {
 const LONG: usize = 200;
 
 impl AmplitudeWatch {
-    /// Cycles of which the mean is judged in a run.
+    /// Number of cycles in the mean during a run.
     pub const WINDOW: usize = 10;
 
     /// A watch with a limit (a share of the commanded amplitude) on the mean of `window` cycles.
@@ -166,9 +166,9 @@ impl AmplitudeWatch {
         }
     }
 
-    /// Takes a row; gives what has changed. Cycles without an amplitude and skipped ones do not count.
+    /// Takes a row; returns a change of the verdict. Cycles without an amplitude and skipped ones do not count.
     pub fn add(&mut self, row: &CycleRow) -> Option<Alarm> {
-        // The bead itself wanders by some tens of nanometres: below a tenth of a micrometre a share says nothing.
+        // Brownian motion is some tens of nanometres, so below an amplitude of 0.1 um a share has no meaning.
         const SMALLEST_UM: f64 = 0.1;
         let counts = row.commanded_um >= SMALLEST_UM && row.reached_um.is_finite();
         if !counts || row.flags.has(CycleFlags::SKIPPED) {
@@ -179,7 +179,7 @@ impl AmplitudeWatch {
         }
         let error = row.reached_um / row.commanded_um - 1.0;
         self.errors.push_back((row.cycle, error));
-        // Another motion is not part of this trend.
+        // A different motion is not part of this trend.
         if !row.moves_as(self.motion) {
             self.motion = (row.stroke_um, row.duration_s);
             self.long.clear();

@@ -1,9 +1,9 @@
-//! A periodic motion of a plan, alone.
+//! A periodic motion of a plan.
 
 use crate::script::WaveShape;
 use std::ops::Range;
 
-/// A periodic motion. Steps that move alike share one, wherever they begin.
+/// A periodic motion. Steps with the same motion share one, wherever they begin.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Periodic {
     /// Frequency of its cycles, Hz.
@@ -13,7 +13,7 @@ pub struct Periodic {
     pub(super) course: Course,
 }
 
-/// How a periodic motion goes.
+/// The shape of a periodic motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Course {
     Wave { shape: WaveShape, amplitude_um: f64 },
@@ -21,7 +21,7 @@ pub(super) enum Course {
 }
 
 impl Periodic {
-    /// Most motions that a plan tells apart.
+    /// Most motions that a plan distinguishes.
     pub const MOST: usize = 64;
 
     pub(super) fn wave(shape: WaveShape, amplitude_um: f64, frequency_hz: f64) -> Self {
@@ -43,7 +43,7 @@ impl Periodic {
         }
     }
 
-    /// Harmonics worth learning: a sine has others than its first only from nonlinearities.
+    /// Harmonics worth learning: only nonlinearities give a sine more than its first.
     pub fn harmonics(&self) -> u32 {
         match self.course {
             Course::Wave {

@@ -14,7 +14,7 @@ const MAX_S: f64 = 30.0 * 86_400.0;
 /// Longest hold of a shortened plan, s.
 const SHORT_HOLD_S: f64 = 20.0;
 
-/// What is known of a labelled step.
+/// Results of a labelled step.
 #[derive(Debug, Clone, Copy)]
 struct Arm {
     cycles: u64,
@@ -139,7 +139,7 @@ impl Layout<'_> {
     }
 
     fn hold(&mut self, step: &Step, duration_s: f64) -> Result<(), ScriptError> {
-        // A hold asks for nothing new after a while.
+        // After a while a hold makes no new demands.
         let duration_s = if self.short {
             duration_s.min(SHORT_HOLD_S)
         } else {
@@ -351,7 +351,7 @@ impl Layout<'_> {
                 known.push(motion);
                 known.len() - 1
             }
-            // Not numbered: nothing can be learned on it.
+            // It gets no number, because nothing can be learned on it.
             None => return,
         };
         if let Some(motion) = known.get_mut(number) {

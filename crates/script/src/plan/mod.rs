@@ -51,7 +51,7 @@ impl Plan {
         self.duration_s
     }
 
-    /// Longest duration: each wait takes as long as it may, s.
+    /// Longest duration, s: each wait takes its longest time.
     pub fn longest_s(&self) -> f64 {
         let waits = self.segments.iter().map(|segment| match segment.motion {
             Motion::Wait { timeout_s, .. } => timeout_s,
@@ -80,7 +80,7 @@ impl Plan {
         &self.stop
     }
 
-    /// Whether a wait or a stop of the script looks at the length of the cell.
+    /// Whether a wait or a stop of the script uses the length of the cell.
     pub fn needs_length(&self) -> bool {
         let waits = self.segments.iter().any(|s| {
             let condition = match &s.motion {
@@ -97,7 +97,7 @@ impl Plan {
             || stop.recovery_above_s.is_some()
     }
 
-    /// When the plan's clock next stands still for a wait, from a segment on, s; infinity: never.
+    /// Time of the next wait from a segment on, s, at which the plan's clock stops; infinity: never.
     pub(crate) fn next_wait_s(&self, segment: usize) -> f64 {
         let index = self.waits.partition_point(|(number, _)| *number < segment);
         self.waits.get(index).map_or(f64::INFINITY, |wait| wait.1)

@@ -3,7 +3,7 @@
 use super::course::Periodic;
 use crate::script::{Condition, MoveShape, OnTimeout, Stop, WaveShape};
 
-/// What a segment does; it starts at the segment's `from_um`.
+/// The motion of a segment, from the segment's `from_um`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Motion {
     /// Stays.

@@ -1,4 +1,4 @@
-//! The periodic motions of a plan: what learning over cycles is laid on.
+//! The periodic motions of a plan, on which learning over cycles works.
 
 use super::course::{Course, Periodic};
 use super::parts::{Motion, Plan, Segment};
