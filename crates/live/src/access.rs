@@ -1,4 +1,4 @@
-//! Who may look and who may act: a random word in the link, and checks of host and origin.
+//! Access control: a random word in the link gives the role, and each request's host and origin are checked.
 
 use std::io::Read;
 use std::net::SocketAddr;
@@ -60,7 +60,7 @@ impl Secrets {
     }
 }
 
-/// Compares without telling by the time it takes how much was right.
+/// Compares in constant time, so that the duration reveals nothing.
 fn same(a: &str, b: &str) -> bool {
     a.len() == b.len()
         && a.bytes()
@@ -82,7 +82,7 @@ pub(crate) fn is_our_host(host: &str, address: SocketAddr) -> bool {
     let Ok(ip) = name.parse::<std::net::IpAddr>() else {
         return false;
     };
-    // An address cannot be rebound; a server on all addresses accepts any.
+    // An IP address cannot be rebound; a server on all addresses accepts any.
     ip.is_loopback() || ip == address.ip() || address.ip().is_unspecified()
 }
 

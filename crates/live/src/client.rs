@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use tungstenite::protocol::{Role as Side, WebSocketConfig};
 use tungstenite::{Error, Message, WebSocket};
 
-/// How often a client is looked after when nothing comes.
+/// Interval of service for a client when nothing comes.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 /// A client that takes nothing for this long is disconnected.
 const STALLED_AFTER: Duration = Duration::from_secs(5);
@@ -112,7 +112,7 @@ pub(crate) fn act(text: &str, role: Role, shared: &Shared) -> Result<(), Command
     Ok(())
 }
 
-/// Whether it is done; not yet, when the socket would have to wait.
+/// Whether the operation is done; not yet if the socket would block.
 fn done(result: Result<(), Error>) -> Result<bool, Error> {
     match result {
         Ok(()) => Ok(true),

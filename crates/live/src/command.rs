@@ -1,4 +1,4 @@
-//! What the operator's page may ask for.
+//! The operator's requests from the page.
 
 use serde::Deserialize;
 
@@ -11,13 +11,13 @@ const NOTE_CHARACTERS: usize = 500;
 pub enum OperatorRequest {
     /// Stop the bead.
     Freeze,
-    /// Go on after a freeze or a pause.
+    /// Continue after a freeze or a pause.
     Resume,
     /// Ramp to park: the run ends.
     Park,
     /// Stop the script's clock and the bead.
     Pause,
-    /// Go on with the script's next step.
+    /// Continue with the script's next step.
     Skip,
     /// A new target.
     Target {
@@ -52,14 +52,14 @@ impl OperatorRequest {
     /// Reads a request. `targets_um` bounds targets if known.
     ///
     /// # Errors
-    /// [`CommandError`], to be told to whoever asked.
+    /// [`CommandError`], for an answer to the client.
     pub fn read(text: &str, targets_um: [f64; 2]) -> Result<Self, CommandError> {
         let command: Self =
             serde_json::from_str(text).map_err(|e| CommandError::Unreadable(e.to_string()))?;
         match command {
             Self::Target { um } => {
                 let [low, high] = targets_um;
-                // Comparisons with an unknown end (NaN) are false: then any finite target may be tried.
+                // Comparisons with an unknown end (NaN) are false, so any finite target is accepted then.
                 if !um.is_finite() || um < low || um > high || um.abs() > 1e6 {
                     return Err(CommandError::OutOfView(
                         um.to_string(),

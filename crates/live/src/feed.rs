@@ -1,4 +1,4 @@
-//! From the threads of a run to the page, without waiting.
+//! Passes data from the threads of a run to the page without waiting.
 
 use crate::row::{OUTLINE_POINTS, PICTURE_MARGIN, Picture, Row};
 use crate::state::{ClipLine, CycleRow, EventLine, Hello, State};
@@ -13,7 +13,7 @@ const PICTURES: usize = 3;
 /// Time between two pictures, s.
 const PICTURE_EVERY_S: f64 = 1.0 / 15.0;
 
-/// What found its ring full since the start.
+/// Items lost to a full ring since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Lost {
     /// Rows.
@@ -24,7 +24,7 @@ pub struct Lost {
     pub pictures: u64,
 }
 
-/// What goes through the ring of words.
+/// The items of the ring of words.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Line {
     /// How the run stands.
@@ -37,7 +37,7 @@ pub enum Line {
     Clip(ClipLine),
 }
 
-/// The run's end of the rings. No call waits; what does not fit is counted in [`Feed::lost`].
+/// The run's end of the rings. No call waits; [`Feed::lost`] counts the items that did not fit.
 #[derive(Debug)]
 pub struct Feed {
     rows: Producer<Row>,
@@ -119,7 +119,7 @@ impl Feed {
         self.lost.rows += u64::from(self.rows.push(*row).is_err());
     }
 
-    /// How the run stands; a few times a second is enough.
+    /// Takes the state of the run; a few calls a second are enough.
     pub fn state(&mut self, state: State) {
         self.line(Line::State(Box::new(state)));
     }
@@ -155,7 +155,7 @@ impl FeedHub {
         &self.hello
     }
 
-    /// The next tick that came, for whoever shows a run without a server.
+    /// The next tick, for callers that show a run without a server.
     pub fn next_row(&mut self) -> Option<Row> {
         self.rows.pop().ok()
     }
@@ -167,13 +167,14 @@ impl FeedHub {
 }
 
 impl PictureFeed {
-    /// Whether a picture is due at this time of the run, s: fifteen a second are.
+    /// Whether a picture is due at this time of the run, s; fifteen a second are due.
     pub fn is_due(&self, time_s: f64) -> bool {
         time_s >= self.next_s
     }
 
-    /// Fills a picture and sends it. `fill` gets an empty vector with room for [`PICTURE_MARGIN`] pixels within
-    /// [`Picture::pixels`], and for [`OUTLINE_POINTS`] points of an outline, so that it need not allocate. Without an empty picture, or with one that makes no sense, none is sent.
+    /// Fills a picture and sends it. `fill` gets an empty vector with room for [`PICTURE_MARGIN`] pixels within [`Picture::pixels`], and
+    /// for [`OUTLINE_POINTS`] points of an outline, so that it need not allocate. It sends nothing if no picture is empty or the filled
+    /// one is invalid.
     pub fn offer(&mut self, time_s: f64, fill: impl FnOnce(&mut Picture)) {
         self.next_s = time_s + PICTURE_EVERY_S;
         let Ok(mut picture) = self.empty.pop() else {

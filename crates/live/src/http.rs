@@ -1,4 +1,4 @@
-//! The little of HTTP that one page needs: a bounded request, a few fixed answers.
+//! The part of HTTP that one page needs: a bounded request, a few fixed answers.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 const HEAD_BYTES: usize = 8192;
 /// Longest body of a request, bytes.
 const BODY_BYTES: usize = 4096;
-/// A request has to be there after this long.
+/// Time within which a request must be complete.
 const REQUEST_WITHIN: Duration = Duration::from_secs(3);
 
 /// Headers of every answer: no page may frame this one, and no content may come from elsewhere.
@@ -24,19 +24,19 @@ pub(crate) struct Request {
     pub path: String,
     /// The word in the link.
     pub word: String,
-    /// The name of what is asked for, where the path alone does not say it.
+    /// The name of the requested item, if the path alone does not give it.
     pub name: String,
     pub host: String,
     pub origin: Option<String>,
-    /// The client's key, where it asks for a WebSocket.
+    /// The client's key, if it requests a WebSocket.
     pub websocket_key: Option<String>,
     pub body: String,
 }
 
-/// Why there is no request.
+/// The reason why there is no request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RequestError {
-    /// Closed, timed out, or broken: there is nobody to answer.
+    /// Closed, timed out or broken: an answer is impossible.
     Gone,
     /// Too long, or not HTTP.
     Bad,

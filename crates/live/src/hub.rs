@@ -13,11 +13,11 @@ use tungstenite::{Bytes, Message};
 const ROWS: u8 = 1;
 /// First byte of a picture.
 const PICTURE: u8 = 2;
-/// Past rows for a new client of a running run; of one that is over, as many as the page can hold.
+/// Past rows for a new client of a running run. A finished run sends as many as the page can hold.
 const PAST_ROWS: usize = 10_000;
-/// What the page can hold of a run, s, and rows at most.
+/// Time of a run that the page can hold, s, and its largest number of rows.
 const HELD: (f64, usize) = (600.0, 1_200_000);
-/// Messages in which a new client gets the past, at most: they have to find room in its queue.
+/// Most messages with past data for a new client: they must fit into its queue.
 const PAST_MESSAGES: usize = 50;
 /// Events kept for new clients.
 const PAST_EVENTS: usize = 300;
@@ -25,7 +25,7 @@ const PAST_EVENTS: usize = 300;
 const PAST_CYCLES: usize = 20_000;
 /// Clips kept for new clients.
 const PAST_CLIPS: usize = 1000;
-/// Rows of one message: a client that reads slowly loses little at a time.
+/// Rows per message, few enough that a slow client loses little at a time.
 const ROWS_OF_A_MESSAGE: usize = 2000;
 
 /// Messages in words.
@@ -109,7 +109,7 @@ impl Hub {
         }
     }
 
-    /// One round: everything that has come since the last one.
+    /// One round: sends everything that has come since the last one.
     pub(crate) fn round(&mut self) {
         let mut clients = self.clients.lock();
         clients.retain(|queue| !queue.is_closed());
@@ -149,7 +149,7 @@ impl Hub {
 }
 
 impl Past {
-    /// Keeps a line, and gives the message that tells it.
+    /// Keeps a line, and returns its message.
     fn take(&mut self, line: Line) -> Message {
         match line {
             Line::State(state) => {
@@ -174,7 +174,7 @@ impl Past {
         }
     }
 
-    /// Tells a new client all that is kept.
+    /// Sends a new client all kept data.
     fn tell(&self, queue: &Queue) {
         if let Some(state) = &self.state {
             queue.push(&text(&Told::State(state)));

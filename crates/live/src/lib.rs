@@ -1,4 +1,4 @@
-//! What people see of a run while it goes: the live page in a browser, and the [`terminal`].
+//! The views of a running run: the live page in a browser, and the [`terminal`].
 //!
 //! A [`Feed`] takes rows, pictures, events and the state from the threads of a run. None of its calls waits. If a ring is full,
 //! the item is dropped and counted. [`Server::start`] serves one page, which is part of the program, on its own threads:
@@ -12,10 +12,10 @@
 //! A client's queue holds two seconds. If the client does not read it, the oldest message is dropped and counted. After five
 //! seconds without progress the connection is closed. So a client can only slow itself down.
 //!
-//! There are two links: the operator's may freeze, park and move, the viewer's may look. Both carry a random word. The server
-//! checks host and origin of each request, so a page from elsewhere cannot reach it through the browser.
+//! There are two links, each with a random word: the operator's link may freeze, park and move; the viewer's link shows only. The
+//! server checks host and origin of each request, so a page from elsewhere cannot reach it through the browser.
 //!
-//! The crate knows no camera, board or loop: whoever runs them fills a [`Feed`] and acts on [`OperatorRequest`]s.
+//! The crate knows no camera, board or loop: the program that runs them fills a [`Feed`] and acts on [`OperatorRequest`]s.
 //!
 //! ```
 //! use cellpos_live::{Feed, Hello, Row, Server, ServerConfig};
@@ -28,7 +28,7 @@
 //! # Ok::<(), cellpos_live::LiveError>(())
 //! ```
 #![forbid(unsafe_code)]
-// What only the server reads of a feed has no reader without it.
+// Without the server, some parts of a feed have no reader.
 #![cfg_attr(not(feature = "server"), allow(dead_code))]
 
 #[cfg(feature = "server")]

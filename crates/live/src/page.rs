@@ -1,6 +1,6 @@
-//! The page, baked into the program.
+//! The page, compiled into the program.
 
-/// What is found at a path: kind and text. Nothing here is secret.
+/// The content of a path: kind and text. Nothing here is secret.
 pub(crate) fn asset(path: &str) -> Option<(&'static str, &'static str)> {
     Some(match path {
         "/style.css" => ("text/css; charset=utf-8", include_str!("page/style.css")),

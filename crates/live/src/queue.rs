@@ -9,7 +9,7 @@ use tungstenite::Message;
 /// Messages that wait for a client: about two seconds' worth.
 const MESSAGES: usize = 100;
 
-/// What waits for a client. When it is full the oldest message goes and is counted.
+/// Messages that wait for a client. If it is full, the oldest message is dropped and counted.
 #[derive(Debug, Default)]
 pub(crate) struct Queue {
     waiting: Mutex<VecDeque<Message>>,
@@ -38,7 +38,7 @@ impl Queue {
         waiting.drain(..).collect()
     }
 
-    /// The oldest that waits, or none after `most`.
+    /// The oldest waiting message, or none after `most`.
     pub(crate) fn next(&self, most: Duration) -> Option<Message> {
         let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         let (mut waiting, _) = self
@@ -53,17 +53,17 @@ impl Queue {
         self.lost.load(Ordering::Relaxed)
     }
 
-    /// Says that the client is gone.
+    /// Marks the client as gone.
     pub(crate) fn close(&self) {
         self.closed.store(true, Ordering::Release);
     }
 
-    /// Whether the client is gone.
+    /// Whether the client has left.
     pub(crate) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
     }
 
-    /// Whether this is the first time it is asked.
+    /// Whether this is the first call.
     pub(crate) fn is_new(&self) -> bool {
         !self.told.swap(true, Ordering::AcqRel)
     }

@@ -1,4 +1,4 @@
-//! What the page gets of a tick, and of a frame, in bytes.
+//! Ticks and frames as bytes for the page.
 
 /// Bytes of one row on the wire.
 pub(crate) const ROW_BYTES: usize = 64;
@@ -97,7 +97,7 @@ pub struct Picture {
     pub height: u16,
     /// `width * height` grey values, row by row.
     pub pixels: Vec<u8>,
-    /// Size of a pixel along the channel, um; negative where the channel runs against the columns.
+    /// Size of a pixel along the channel, um; negative if the channel runs against the columns.
     pub um_per_px: f32,
     /// Whether the channel runs along the rows (`false`) or the columns (`true`) of pixels.
     pub upright: bool,
@@ -105,11 +105,11 @@ pub struct Picture {
     pub first_um: f32,
     /// Centre of bead or cell, px; NaN without one.
     pub centre_px: [f32; 2],
-    /// Half width of what is drawn around it, px, along columns and rows.
+    /// Half width of the mark around it, px, along columns and rows.
     pub half_px: [f32; 2],
     /// Outline of the cell, px; empty for a bead.
     pub outline_px: Vec<[f32; 2]>,
-    /// Half width of the gate in which it is looked for, px; NaN without one.
+    /// Half width of the search gate, px; NaN without one.
     pub gate_px: f32,
     /// Time since the start of the run, s.
     pub time_s: f32,
@@ -136,7 +136,7 @@ impl Picture {
         }
         out.extend(&self.pixels);
         if points > 0 {
-            // The page reads them as they lie: at a multiple of their size.
+            // The page reads them in place, so they are aligned to a multiple of their size.
             out.resize(out.len().next_multiple_of(4), 0);
             for value in self.outline_px.iter().take(points).flatten() {
                 out.extend(value.to_le_bytes());

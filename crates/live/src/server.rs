@@ -22,9 +22,9 @@ use std::time::Duration;
 pub const MOST_CLIENTS: usize = 32;
 /// Places that viewers leave free: an operator always finds one to freeze and park from.
 const FOR_OPERATORS: usize = 8;
-/// How often the hub sends.
+/// Interval between two sends of the hub.
 const ROUND_EVERY: Duration = Duration::from_millis(40);
-/// How often new connections are looked for.
+/// Interval between two checks for new connections.
 const ACCEPT_EVERY: Duration = Duration::from_millis(20);
 /// Stack of a client's thread, bytes.
 const STACK: usize = 256 * 1024;
@@ -34,9 +34,9 @@ const STACK: usize = 256 * 1024;
 pub struct ServerConfig {
     /// Address and port; port 0: any that is free.
     pub address: SocketAddr,
-    /// Whether an address other than this machine's own (loopback) was asked for by name.
+    /// Whether the user explicitly requested an address beyond this machine's own (loopback).
     pub beyond_this_machine: bool,
-    /// Called by each thread of the server as its first act: its place among the processors.
+    /// Each thread of the server calls it first, to choose its processors.
     pub on_thread: Option<Arc<dyn Fn() + Send + Sync>>,
     /// Gives a clip by its name, as the page plays it ([`Film`]); called on a client's thread.
     pub film: Option<Film>,
@@ -63,10 +63,10 @@ impl Default for ServerConfig {
     }
 }
 
-/// Why there is no page.
+/// The reason why there is no page.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
-    /// An address that others can reach was not asked for by its own option.
+    /// Other machines can reach the address, but its own option does not permit that.
     #[error(
         "{0} can be reached from other machines: whoever has the link can move the PZT, and nothing is encrypted. Use an SSH tunnel to 127.0.0.1, or ask for it with --view-unsafe-address"
     )]
@@ -85,7 +85,7 @@ pub enum LiveError {
     System(#[from] std::io::Error),
 }
 
-/// Who has an address that cannot be listened on, as the end of a sentence.
+/// The program that holds the address, as the end of a sentence.
 fn held(address: SocketAddr) -> &'static str {
     let heard = || -> std::io::Result<String> {
         let mut stream = TcpStream::connect_timeout(&address, PATIENCE)?;
@@ -109,12 +109,12 @@ fn held(address: SocketAddr) -> &'static str {
     }
 }
 
-/// How long whoever has the address is given to say who it is.
+/// Time for the program at the address to identify itself.
 const PATIENCE: Duration = Duration::from_millis(300);
 /// Identity of a run's page on its line to the program.
 const ITS_FIRST_LINE: &str = "The line to the program: messages in, requests out";
 
-/// A page that is being served; dropping it ends its threads.
+/// A served page; dropping it ends its threads.
 pub struct Server {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
@@ -130,7 +130,7 @@ impl Server {
     /// Listens and serves. `command` is called on a client's thread for each request of the operator: it must not wait.
     ///
     /// # Errors
-    /// An address that cannot be listened on, or that others can reach without having been asked for by name.
+    /// The address cannot be used, or other machines could reach it although the user did not request that.
     pub fn start(
         config: &ServerConfig,
         feed: FeedHub,
@@ -213,11 +213,11 @@ impl Server {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        // The hub first, so that how the run ended is in the clients' queues when they are told to go.
+        // Stop the hub first, so that the clients' queues hold the end of the run before the clients are closed.
         for end in [&self.shared.ending, &self.shared.over] {
             end.store(true, Ordering::Release);
             if !self.threads.is_empty() {
-                // A thread that panicked has nothing to hand over.
+                // A thread that panicked has no result.
                 let _ = self.threads.remove(0).join();
             }
         }
@@ -229,7 +229,7 @@ fn serve_hub(mut hub: Hub, shared: &Shared) {
         hub.round();
         thread::sleep(ROUND_EVERY);
     }
-    // What came last, for whoever still reads.
+    // The last messages, for clients that still read.
     hub.round();
 }
 
@@ -251,7 +251,7 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
     }
 }
 
-/// Gives a connection a thread, in place of one that has said nothing yet if need be, or sends it away.
+/// Gives a connection a thread, or refuses it. If necessary it replaces a connection that has sent nothing yet.
 fn greet(mut stream: TcpStream, number: u64, shared: &Arc<Shared>) -> Option<JoinHandle<()>> {
     // The listener does not wait; its connections do.
     stream.set_nonblocking(false).ok()?;
@@ -329,7 +329,7 @@ fn converse(mut stream: TcpStream, number: u64, shared: &Shared) {
             }
             None => http::say(&mut stream, "404 Not Found", "there is no such clip"),
         },
-        // A browser always says where a script comes from: without an origin it is not our page.
+        // A browser always states the origin of a script: a request without one is not from this page.
         ("GET", "/live", Some(_)) if request.origin.is_none() => {
             http::say(&mut stream, "403 Forbidden", "no origin");
         }

@@ -1,4 +1,4 @@
-//! What the server's threads share.
+//! Data shared by the server's threads.
 
 use crate::access::{Role, Secrets};
 use crate::command::OperatorRequest;
@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tungstenite::Message;
 
-/// What the server's threads share.
+/// Data shared by the server's threads.
 pub(crate) struct Shared {
     pub(crate) secrets: Secrets,
     pub(crate) address: SocketAddr,
@@ -79,7 +79,7 @@ impl Shared {
         self.silent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The first act of a thread of the server.
+    /// The first call of each server thread.
     pub(crate) fn enter_thread(&self) {
         if let Some(on_thread) = &self.on_thread {
             on_thread();

@@ -2,12 +2,12 @@
 
 use serde::Serialize;
 
-/// What does not change during a run.
+/// Constant data of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Hello {
     /// Name of the run.
     pub name: String,
-    /// What runs: command, controller, rig.
+    /// The run: command, controller, rig.
     pub subtitle: String,
     /// Period of the loop, us.
     pub period_us: f64,
@@ -19,20 +19,20 @@ pub struct Hello {
     pub view_um: [f64; 2],
     /// Budget of a tick, us.
     pub budget_us: f64,
-    /// Lowest possible RMS error of holding, nm, where the model tells.
+    /// Lowest possible RMS error of holding, nm, if the model gives it.
     pub bound_nm: Option<f64>,
-    /// Spectral density that the linear model of this loop predicts for the measured error while it holds: frequency in Hz, amplitude
-    /// from Brownian motion in nm/sqrt(Hz), and amplitude for each nm RMS of localisation noise; empty where it predicts none.
+    /// Spectral density that the loop's linear model predicts for the measured error of a hold. Each entry has frequency in Hz, amplitude
+    /// from Brownian motion in nm/sqrt(Hz), and amplitude per nm RMS of localisation noise. Empty without a prediction.
     pub predicted_spectrum: Vec<[f64; 3]>,
     /// Whether the operator may set the target.
     pub steered: bool,
-    /// Whether the target is a displacement of the PZT, moved by hand, rather than a position that a loop holds.
+    /// Whether the target is a displacement of the PZT, moved by hand, instead of a position that a loop holds.
     pub by_hand: bool,
     /// Whether notes are kept with the run.
     pub notes: bool,
-    /// Whether a script says where the bead is to be: it can be paused, and its steps skipped.
+    /// Whether a script sets the target; it can be paused, and its steps skipped.
     pub script: bool,
-    /// Whether a cell is followed rather than a bead.
+    /// Whether the run tracks a cell instead of a bead.
     pub cell: bool,
     /// Whether the run has pictures.
     pub pictures: bool,
@@ -96,20 +96,20 @@ impl Default for Banner {
     }
 }
 
-/// The last word of a run: how it ended, and where that leaves the rig. The page keeps it when the program is gone.
+/// The final message of a run: its end, and the state of the rig. The page keeps it after the program has ended.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LastWord {
     /// `done`, `stopped` (by the operator), `not-kept`, `safe`, `failed`.
     pub how: &'static str,
     /// Observation, and expectation if different.
     pub seen: String,
-    /// The remedy; empty if there is none to name.
+    /// The remedy; empty if there is nothing to do.
     pub to_do: String,
     /// Where the PZT is.
     pub pzt: String,
 }
 
-/// How the run stands, a few times a second. The same numbers as in the run's summary.
+/// The state of the run, sent a few times a second, with the numbers of the run's summary.
 #[derive(Debug, Clone, PartialEq, Serialize, Default)]
 pub struct State {
     /// The banner.
@@ -120,9 +120,9 @@ pub struct State {
     pub ticks: u64,
     /// RMS of the measured error since the loop settled, nm.
     pub rms_nm: Option<f64>,
-    /// Localisation noise as vision states it, nm RMS.
+    /// Localisation noise reported by vision, nm RMS.
     pub fix_noise_nm: Option<f64>,
-    /// Wake-up of the ticks behind their due time, us: the least time that 99.9 % of them do not exceed.
+    /// Lateness of the ticks' wake-ups, us: the 99.9 % quantile.
     pub wake_us: Option<f64>,
     /// Computing time of the ticks, us, with the same percentile.
     pub compute_us: Option<f64>,
@@ -138,11 +138,11 @@ pub struct State {
     pub coasted: u64,
     /// Records that are not on disk.
     pub records_lost: u64,
-    /// Cycle that runs, from 1, and how many there are, where a script has cycles.
+    /// Present cycle, from 1, and their number, if the script has cycles.
     pub cycle: Option<[u64; 2]>,
-    /// What is being done, where no script says it.
+    /// The present task, if there is no script.
     pub doing: Option<String>,
-    /// What comes next in the script.
+    /// The next step of the script.
     pub next: Option<String>,
     /// Time left, s, if known.
     pub left_s: Option<f64>,

@@ -1,4 +1,4 @@
-//! A file that only ever grows by whole blocks.
+//! A file that grows only by whole blocks.
 
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
@@ -6,10 +6,10 @@ use std::io;
 use std::path::Path;
 use std::time::Duration;
 
-/// Most bytes that wait for a disk that refuses them: some minutes of a run.
+/// Most bytes to keep while the disk refuses them: some minutes of a run.
 const MOST_WAITING: usize = 1 << 26;
 
-/// Opens a file for writing that is really there, not somewhere else by a symbolic link.
+/// Opens a file for writing; refuses a symbolic link to another place.
 pub(crate) fn open_here(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
     #[cfg(unix)]
     {
@@ -30,25 +30,24 @@ pub(crate) fn open_here(options: &mut OpenOptions, path: &Path) -> io::Result<Fi
     }
 }
 
-/// A file to append to, as far as the writer needs it.
+/// The operations of a file that the writer needs.
 pub(crate) trait Sink {
-    /// Appends all bytes, or fails, perhaps after some of them.
+    /// Appends all bytes, or fails, perhaps after a part.
     fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
     /// Cuts the file to a length.
     fn cut(&mut self, length: u64) -> io::Result<()>;
-    /// Sees to it that the disk has everything: now, or soon ([`Sink::awaited`]); then the next sync says whether it came to
-    /// that.
+    /// Syncs the file to the disk: now, or soon ([`Sink::awaited`]). In the second case the next sync reports the result.
     fn sync(&mut self) -> io::Result<()>;
-    /// Waits for a sync that is still to come, at most for a time; [`io::ErrorKind::TimedOut`] when it did not.
+    /// Waits for a pending sync, at most for a time; [`io::ErrorKind::TimedOut`] if it did not finish.
     fn settle(&mut self, most: Duration) -> io::Result<()> {
         let _ = most;
         Ok(())
     }
-    /// Of the syncs that were asked for, how many, the newest, are still to come.
+    /// Number of requested syncs, the newest ones, that are still pending.
     fn awaited(&self) -> u64 {
         0
     }
-    /// Fails when nobody will find what is written: the file was removed.
+    /// Fails if the file was removed, so that nobody would find the data.
     fn is_there(&self) -> io::Result<()>;
 }
 
@@ -64,13 +63,13 @@ pub(crate) struct Blocks<S> {
     waiting: Vec<u8>,
     /// Rows, lines or events in `waiting`.
     waiting_units: u64,
-    /// Those that did not find room in `waiting` any more.
+    /// Rows, lines or events for which `waiting` had no room.
     dropped_units: u64,
-    /// Those appended since the last sync.
+    /// Rows, lines or events appended since the last sync.
     unsynced_units: u64,
-    /// Those of each sync that is still to come, the oldest first.
+    /// Rows, lines or events of each pending sync, the oldest first.
     pending: VecDeque<u64>,
-    /// Those of which the disk said that it does not have them.
+    /// Rows, lines or events that the disk reported as lost.
     unkept_units: u64,
 }
 
@@ -100,7 +99,7 @@ impl<S: Sink> Blocks<S> {
         }
     }
 
-    /// Appends what waits, whole or not at all.
+    /// Appends the waiting blocks, completely or not at all.
     pub(crate) fn write(&mut self) -> io::Result<()> {
         if self.waiting.is_empty() {
             return Ok(());
@@ -111,7 +110,7 @@ impl<S: Sink> Blocks<S> {
             self.torn = false;
         }
         if let Err(error) = self.sink.append(&self.waiting) {
-            // Cutting frees nothing and so works on a full disk; if not, it is tried again before the next block.
+            // Truncation needs no space, so it works on a full disk. If it fails, it is tried again before the next block.
             self.torn = self.sink.cut(self.good).is_err();
             return Err(error);
         }
@@ -122,7 +121,7 @@ impl<S: Sink> Blocks<S> {
         Ok(())
     }
 
-    /// Sees to it that the disk has what was appended, if anything was.
+    /// Syncs appended data to the disk, if there are any.
     pub(crate) fn sync(&mut self) -> io::Result<()> {
         if !self.unsynced {
             return Ok(());
@@ -134,7 +133,7 @@ impl<S: Sink> Blocks<S> {
         self.account(synced)
     }
 
-    /// Waits until the disk has what was synced, at most for a time. Rows without confirmation by then count as lost.
+    /// Waits until the disk confirms the syncs, at most for a time. Rows without confirmation by then count as lost.
     pub(crate) fn settle(&mut self, most: Duration) -> io::Result<()> {
         let settled = self.sink.settle(most);
         if let Err(error) = &settled
@@ -145,7 +144,7 @@ impl<S: Sink> Blocks<S> {
         self.account(settled)
     }
 
-    /// Rows, lines or events that are in the file as far as this program can tell, and of which the disk has not said so.
+    /// Rows, lines or events that this program has written but the disk has not confirmed.
     pub(crate) fn unconfirmed_units(&self) -> u64 {
         let awaited = self.awaited().min(self.pending.len());
         self.unsynced_units + self.pending.iter().rev().take(awaited).sum::<u64>()
@@ -170,12 +169,12 @@ impl<S: Sink> Blocks<S> {
         &self.sink
     }
 
-    /// Whether the file is still where it was made.
+    /// Whether the file still exists at its path.
     pub(crate) fn is_there(&self) -> io::Result<()> {
         self.sink.is_there()
     }
 
-    /// Rows, lines or events that were taken and are not in the file, or that the disk said it does not have.
+    /// Rows, lines or events that were taken but are not in the file, or that the disk reported as lost.
     pub(crate) fn lost(&self) -> u64 {
         self.waiting_units + self.dropped_units + self.unkept_units
     }

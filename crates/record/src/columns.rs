@@ -43,7 +43,7 @@ impl Kind {
     }
 }
 
-/// Columns that a run has only if it has something to say in them.
+/// Groups of columns that a run has only if it needs them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Group {
@@ -171,11 +171,11 @@ columns! {
     partner U8 Partner,
 }
 
-/// Name of the last column of the file: CRC-32 of the values before it in the row, each in its own width, little-endian. A
-/// row of a block that the disk never wrote (zeros) or wrote wrongly does not have the right one.
+/// Name of the last column of the file: CRC-32 of the values before it in the row, each in its own width, little-endian. It is
+/// wrong in a row of a block that the disk never wrote (zeros) or wrote wrongly.
 pub(crate) const CHECK: &str = "check";
 
-/// Bytes of a row in the file, the check included, the frame around batches not.
+/// Bytes of a row in the file, with the check, without the frame around batches.
 pub(crate) fn row_bytes(groups: &[Group]) -> usize {
     let wanted = COLUMNS.iter().filter(|c| groups.contains(&c.group));
     wanted.map(|c| c.kind.width()).sum::<usize>() + Kind::U32.width()
@@ -205,7 +205,7 @@ fn schema(groups: &[Group], law: &[String]) -> SchemaRef {
     Arc::new(Schema::new(fields).with_metadata(HashMap::from([format])))
 }
 
-/// The first value of a row that the groups have no column for and that is not unknown.
+/// The first known value of a row for which the groups have no column.
 fn without_column(
     row: &TickRecord,
     unknown: &TickRecord,
@@ -295,7 +295,7 @@ impl Builder {
         &self.schema
     }
 
-    /// Takes a row; gives the name of a value that has no column in this run.
+    /// Takes a row; returns the name of a value that has no column in this run.
     pub(crate) fn push(&mut self, row: &TickRecord) -> Option<&'static str> {
         self.row.clear();
         for (column, values) in &mut self.columns {

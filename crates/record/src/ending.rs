@@ -1,7 +1,7 @@
-//! The end of a run folder, within a bound: a disk that has stopped to answer must not keep the program.
+//! Ends a run folder within a time limit: a disk that no longer answers must not hold the program.
 //!
-//! Whatever touches the disk here is done on threads that are waited for as long as a slow disk may take, and left behind
-//! after that. A thread that hangs in the kernel blocks only itself; unconfirmed rows count as lost.
+//! Separate threads do all work on the disk here. The program waits for them as long as a slow disk may take, and then leaves
+//! them behind. A thread that hangs in the kernel blocks only itself; unconfirmed rows count as lost.
 
 use crate::error::RecordError;
 use crate::faults::Faults;
@@ -29,7 +29,7 @@ fn within<T: Send + 'static>(
 ) -> Option<T> {
     let (done, result) = mpsc::channel();
     let hand_over = move || {
-        // Nobody who listens: it came too late.
+        // The receiver is gone: the result came too late.
         let _ = done.send(work());
     };
     let thread = thread::Builder::new().name("cellpos-finish".to_owned());
@@ -44,13 +44,12 @@ fn no_answer(path: &Path, after: Duration) -> RecordError {
 }
 
 impl RunWriter {
-    /// Writes what waits, the end of `run.toml` (`ended_utc` and the counts are set here), and `ticks.parquet`.
+    /// Writes the waiting rows, the end of `run.toml` (sets `ended_utc` and the counts), and `ticks.parquet`.
     ///
-    /// The rows are read back. Every row that does not come back counts as lost, in addition to `end.rows_lost`; the summary's
-    /// `records_lost` is the sum. A failing disk is no
-    /// error here either: what could be written is there, and [`Finished`] says the rest. A disk that does not answer has 15 s
-    /// for the last rows. A run on the virtual clock, which syncs only here, waits a minute and a second for each 5 MB, and so
-    /// does `ticks.parquet`.
+    /// It reads the rows back. Every row that does not come back counts as lost, in addition to `end.rows_lost`; the summary's
+    /// `records_lost` is the sum. A failing disk is not an error here: the folder holds everything that could be written, and
+    /// [`Finished`] reports the rest. A disk that does not answer has 15 s for the last rows. A run on the virtual clock, which
+    /// syncs only here, waits a minute and a second for each 5 MB, and so does `ticks.parquet`.
     pub fn finish(self, end: RunEnd) -> Finished {
         let Self {
             folder,
@@ -98,7 +97,7 @@ impl RunWriter {
     }
 }
 
-/// What is known of the end so far.
+/// The end of the run as known so far.
 struct Ending {
     folder: PathBuf,
     meta: RunMeta,
@@ -178,7 +177,7 @@ impl Ending {
     }
 }
 
-/// Writes `ticks.parquet`; without the feature there is none, and none is missing.
+/// Writes `ticks.parquet`. Without the feature the file does not exist and does not count as missing.
 #[cfg(feature = "parquet")]
 fn parquet(folder: &Path) -> Result<(), RecordError> {
     let run = RunReader::open(folder)?;

@@ -1,4 +1,4 @@
-//! What can go wrong with a run folder before or after the run.
+//! Errors of a run folder before or after the run.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ pub enum RecordError {
         /// Why it failed.
         source: std::io::Error,
     },
-    /// The folder is no run.
+    /// The folder is not a run.
     #[error(
         "{} is not a run folder (it has no {}); runs are folders such as runs/20261121T093000Z-track",
         path.display(),
@@ -33,9 +33,9 @@ pub enum RecordError {
         size(*free)
     )]
     NoSpace {
-        /// Where it was to be written.
+        /// The folder of the run.
         path: PathBuf,
-        /// Bytes that it may take.
+        /// Bytes that the run may need.
         needed: u64,
         /// Bytes that are left.
         free: u64,
@@ -48,7 +48,7 @@ pub enum RecordError {
         /// The columns that there are.
         known: Vec<String>,
     },
-    /// A column that is asked for twice.
+    /// A column that is requested twice.
     #[error("the column `{0}` is asked for twice")]
     Twice(String),
     /// An export without a row.

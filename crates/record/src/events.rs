@@ -9,7 +9,7 @@ use std::path::Path;
 pub struct Event {
     /// Time since the start of the run, s.
     pub time_s: f64,
-    /// What happened, in a word or two joined by `-`: `bead-lost`, `safe`, `disk-error`.
+    /// The event in one or two words joined by `-`: `bead-lost`, `safe`, `disk-error`.
     pub event: String,
     /// Particulars; names of numbers carry their unit.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
@@ -46,11 +46,11 @@ impl Event {
 pub struct Events {
     /// The events, in the order written.
     pub events: Vec<Event>,
-    /// Lines that are no event: cut off, or damaged.
+    /// Invalid lines: cut off or damaged.
     pub unreadable_lines: usize,
 }
 
-/// Reads an event log as far as it is readable. A log that is not there holds nothing.
+/// Reads an event log as far as it is readable. A missing log counts as empty.
 ///
 /// # Errors
 /// [`RecordError::Io`] when the file exists and cannot be read.

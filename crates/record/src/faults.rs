@@ -1,6 +1,6 @@
 //! What the disk refused.
 
-/// What could not be written so far.
+/// The data that could not be written so far.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Faults {
     /// Rows not written.

@@ -1,4 +1,4 @@
-//! A run read during its recording, or afterwards: the rows since the last look.
+//! Reads a run during its recording or afterwards: the rows since the last call.
 
 use crate::error::RecordError;
 use crate::events::Event;
@@ -11,10 +11,10 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// Most bytes of events taken at one look.
+/// Most bytes of events per call.
 const MOST_EVENTS: u64 = 1 << 20;
 
-/// Reads behind a writer in another process. Nothing is locked, and the writer does not know.
+/// Follows a writer in another process, without locks and without the writer's knowledge.
 pub struct Follow {
     reader: RunReader,
     stream: Stream<BufReader<File>>,
@@ -25,7 +25,7 @@ impl Follow {
     /// Begins with the first row.
     ///
     /// # Errors
-    /// [`RecordError`] if the folder is no run, or one of a newer version.
+    /// [`RecordError`] if the folder is not a run, or if a newer version wrote it.
     pub fn open(folder: &Path) -> Result<Self, RecordError> {
         let reader = RunReader::open(folder)?;
         let path = folder.join(TICKS_ARROW);
@@ -44,7 +44,7 @@ impl Follow {
         &self.reader
     }
 
-    /// Hands over the rows that have come, batch by batch.
+    /// Passes on the new rows, batch by batch.
     ///
     /// # Errors
     /// The file system refuses to read.
@@ -61,8 +61,7 @@ impl Follow {
         read().map_err(RecordError::io("cannot read", path))
     }
 
-    /// The events that have come; a line that is being written is left for the next look, and one that is damaged is passed
-    /// over.
+    /// The new events. An unfinished line is left for the next call; a damaged one is skipped.
     ///
     /// # Errors
     /// The log exists and cannot be read.

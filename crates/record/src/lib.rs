@@ -1,4 +1,4 @@
-//! Run folders: append-only columns while running, read back whatever happened, exported.
+//! Run folders: append-only columns during a run, readable after any failure, exported to other formats.
 //!
 //! A run is a folder `runs/<UTC time>-<name>/` that is never overwritten:
 //!
@@ -13,9 +13,9 @@
 //! | `learned.toml` | of a script: the feed-forward learned over its cycles | replaced in one step each second |
 //! | `sessions/` | of a run that was resumed: a run folder for each further session | |
 //!
-//! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so a tick
-//! never calls it. Rows that the disk refuses wait in memory and are tried again. Rows that never reached the disk are counted
-//! ([`Faults`]). The run ends readable, because a truncated batch is removed.
+//! **While running** a [`RunWriter`] belongs to the recorder thread. It may allocate and block on the disk, so a tick never calls it. If
+//! the disk refuses rows, they wait in memory for another try. Rows that never reach the disk are counted ([`Faults`]). A truncated batch
+//! is removed, so the run remains readable.
 //!
 //! **Afterwards** a [`RunReader`] reads a truncated run up to its last complete batch, and a damaged one around the damage. It
 //! never panics on a damaged file, and it reports the missing rows ([`Lost`]).
@@ -23,7 +23,7 @@
 //! Plain CSV records (`time_s,pzt_um,bead_um`) are read and written by `cellpos-table`, which needs neither Arrow nor
 //! Parquet; [`RunReader::to_record`] makes one from a run.
 //!
-//! Not for data that a tick waits for, and no locking: one writer a folder.
+//! Not for data that a tick waits for. There is no locking: one writer per folder.
 //!
 //! ```
 //! use cellpos_record::{Event, RunEnd, RunMeta, RunReader, RunWriter};
@@ -78,7 +78,7 @@ pub const FORMAT: u32 = 2;
 pub const RUN_TOML: &str = "run.toml";
 /// Name of the append-only columns in a run folder.
 pub const TICKS_ARROW: &str = "ticks.arrow";
-/// Name of the columns of a finished run.
+/// Name of the file of columns of a finished run.
 pub const TICKS_PARQUET: &str = "ticks.parquet";
 /// Name of the per-cycle table in a run folder.
 pub const CYCLES_CSV: &str = "cycles.csv";

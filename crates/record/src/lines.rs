@@ -1,4 +1,4 @@
-//! A text file that only ever grows by whole lines.
+//! A text file that grows only by whole lines.
 
 use crate::blocks::{Blocks, open_here};
 use crate::error::RecordError;
@@ -9,12 +9,12 @@ use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// A text file with a head line, appended to line by line: a line that was acknowledged is in the file, whole, whatever
-/// happens to this process afterwards.
+/// A text file with a head line that grows line by line. An acknowledged line is completely in the file, whatever happens to this
+/// process afterwards.
 ///
-/// Only one process can have it open: the file is locked, and the lock dies with the process. Lines that the disk refuses
-/// wait and are tried again with the next ones; when too much waits, the newest are dropped and counted. Belongs to the
-/// recorder thread; may block.
+/// Only one process can have it open: it holds a lock, which ends with the process. Lines that the disk refuses wait and are
+/// tried again with the next ones; when too much waits, the newest are dropped and counted. Belongs to the recorder thread; may
+/// block.
 pub struct LineFile {
     blocks: Blocks<SyncedFile>,
     sync: bool,
@@ -23,15 +23,15 @@ pub struct LineFile {
     failing: bool,
 }
 
-/// The whole lines of a text: without a last one that was cut off.
+/// The complete lines of a text, without a last one that was cut off.
 pub fn whole_text(text: &str) -> &str {
     text.get(..whole_lines(text.as_bytes()) as usize)
         .unwrap_or("")
 }
 
 impl LineFile {
-    /// Opens or makes a file; a last line that was cut off is cut away, and a file without lines gets the head. `sync`: wait
-    /// for the disk at each write.
+    /// Opens or makes a file. It removes a last line that was cut off, and writes the head into an empty file. `sync`: wait for
+    /// the disk at each write.
     ///
     /// # Errors
     /// [`RecordError::Io`] when it cannot be opened, or another process has it open.
@@ -80,7 +80,7 @@ impl LineFile {
         }
     }
 
-    /// Writes what waits; says whether nothing waits any more.
+    /// Writes the waiting lines; returns whether all are written.
     pub fn flush(&mut self) -> bool {
         let written = self.write();
         self.failing = written.is_err();
@@ -98,7 +98,7 @@ impl LineFile {
         }
     }
 
-    /// Writes what waits for the last time, and waits for the disk to confirm it.
+    /// Writes the waiting lines for the last time, and waits for the disk to confirm them.
     pub fn close(&mut self) {
         self.flush();
         if self.sync
@@ -121,7 +121,7 @@ impl LineFile {
         self.failing
     }
 
-    /// What could not be written: lines dropped, and those that still wait.
+    /// Lines that could not be written: dropped ones, and those that still wait.
     pub fn faults(&self) -> Faults {
         Faults {
             rows_lost: self.blocks.lost(),

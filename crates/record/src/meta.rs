@@ -1,4 +1,4 @@
-//! `run.toml`: how a run came about, and how it ended.
+//! `run.toml`: the conditions of a run, and its end.
 
 use crate::columns::{GROUPS, Group};
 use crate::error::RecordError;
@@ -69,13 +69,13 @@ fn hexadecimal(bytes: &[u8]) -> String {
     text
 }
 
-/// How a run ended; absent from `run.toml` while it runs, and for ever if it was killed.
+/// The end of a run. It is absent from `run.toml` during the run, and remains absent if the program was killed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunEnd {
-    /// When, UTC. Set by [`crate::RunWriter::finish`].
+    /// Time of the end, UTC. Set by [`crate::RunWriter::finish`].
     #[serde(default)]
     pub ended_utc: String,
-    /// In a word or two: `done`, `interrupted`, `safe`.
+    /// The outcome in one or two words: `done`, `interrupted`, `safe`.
     pub outcome: String,
     /// Rows on the disk. Set by [`crate::RunWriter::finish`].
     #[serde(default)]
@@ -119,7 +119,7 @@ pub struct RunMeta {
     /// The command line, word by word.
     #[serde(default)]
     pub command_line: Vec<String>,
-    /// The folder that it was started from: what relative paths of `command_line` and `inputs` are meant from.
+    /// The folder from which it was started; relative paths of `command_line` and `inputs` start there.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub started_in: String,
     /// Seed of every random number of the run (as text above 2^63).
@@ -143,7 +143,7 @@ pub struct RunMeta {
     /// Real-time conditions obtained and not obtained, machine, kernel.
     #[serde(default)]
     pub conditions: toml::Table,
-    /// The whole configuration in force.
+    /// The whole configuration used.
     #[serde(default)]
     pub config: toml::Table,
     /// The model in force.

@@ -1,4 +1,4 @@
-//! Reading a run, whatever happened to it.
+//! Reads a run, even a truncated or damaged one.
 
 use crate::error::RecordError;
 use crate::events::{Events, read_events};
@@ -12,15 +12,15 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-/// Largest metadata that are believed, bytes.
+/// Largest accepted metadata, bytes.
 const MOST_META: u64 = 1 << 26;
 
-/// Rows missing between two that are there.
+/// A gap: rows missing between two existing ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Gap {
     /// Number of the last row before.
     pub after_seq: u64,
-    /// Number of the first row behind.
+    /// Number of the first row after.
     pub before_seq: u64,
 }
 
@@ -40,11 +40,11 @@ pub struct Lost {
     pub gaps: Vec<Gap>,
     /// Rows missing in all breaks.
     pub rows: u64,
-    /// Rows that are not what was written: their check is wrong.
+    /// Rows that differ from the written ones: their check is wrong.
     pub damaged_rows: u64,
-    /// Rows whose number is not larger than the one before: never in a sound run.
+    /// Rows whose number is not larger than the one before: never in an intact run.
     pub disordered_rows: u64,
-    /// Bytes passed over because they made no sense.
+    /// Invalid bytes that were skipped.
     pub damaged_bytes: u64,
     /// Bytes of a batch cut off at the end.
     pub torn_bytes: u64,
@@ -62,7 +62,7 @@ pub struct RunReader {
 }
 
 impl RunReader {
-    /// Opens a run folder. Damaged or missing metadata are no error ([`RunReader::meta`] says so): the rows still read.
+    /// Opens a run folder. Damaged or missing metadata are not an error ([`RunReader::meta`] reports them): the rows are still readable.
     ///
     /// # Errors
     /// [`RecordError::NotARun`] without `ticks.arrow`, [`RecordError::Newer`] for a format that this version does not know.
@@ -110,7 +110,7 @@ impl RunReader {
         self.meta.as_ref().map_or(&[], |meta| &meta.law_columns)
     }
 
-    /// The rows, batch by batch, so that a night's run needs no night's memory.
+    /// The rows, batch by batch, so that memory does not grow with the length of a run.
     ///
     /// # Errors
     /// [`RecordError::Io`] when the file cannot be opened.
@@ -126,7 +126,7 @@ impl RunReader {
         })
     }
 
-    /// The last row that a condition holds for, without reading those before it.
+    /// The last row that meets a condition, found without reading the earlier rows.
     ///
     /// # Errors
     /// [`RecordError::Io`] when the file cannot be opened, or the disk refuses to read on.
@@ -142,7 +142,7 @@ impl RunReader {
             .map_err(RecordError::io("cannot read", path))
     }
 
-    /// All rows, and what is missing.
+    /// All rows, and the missing parts.
     ///
     /// # Errors
     /// [`RecordError::Io`] when the file cannot be opened.
@@ -163,9 +163,9 @@ impl RunReader {
         read_events(&self.folder.join(EVENTS_JSONL))
     }
 
-    /// The run as a plain record: commanded PZT displacement, and the bead position that the camera had delivered
-    /// when the command was given (so the camera's delay is in it, as in any record of two instruments). Missing rows
-    /// are filled: the command is held, the bead not seen. Takes 24 bytes a row; an export has the other columns.
+    /// The run as a plain record: commanded PZT displacement, and the bead position that the camera had delivered at the time of the
+    /// command. So it contains the camera's delay, as any record of two instruments does. Missing rows are filled: the command is held,
+    /// the bead not seen. Takes 24 bytes a row; an export has the other columns.
     ///
     /// # Errors
     /// [`RecordError`] if the rows cannot be read, [`cellpos_table::TableProblem::TooShort`] with fewer than two.
@@ -189,14 +189,14 @@ impl RunReader {
     }
 }
 
-/// Deviation of a step that comes of computing with it, in steps.
+/// Deviation of a step that comes from rounding alone, in steps.
 const ROUNDING: f64 = 1e-3;
 
-/// Puts the times of ticks on the even grid of their periods. A tick waits for its frame, or for the timer, and the next one may be
-/// a quarter of a period behind it: each has a period of its own all the same. A period without a tick is one only if the ticks stay
-/// behind by it.
+/// Puts the times of ticks on the even grid of their periods. A tick waits for its frame or for the timer, so the next tick may follow it
+/// by only a quarter of a period. Each tick still has its own period. A period counts as one without a tick only if the later ticks
+/// remain late by it.
 fn periods(time_s: &mut [f64]) {
-    /// Lateness from which a period had no tick: halfway between a tick of the timer, 0.5 late at most, and one of the next period.
+    /// Lateness that shows a period without a tick: halfway between a tick of the timer, at most 0.5 late, and one of the next period.
     const SKIPPED: f64 = 0.75;
     /// Share of the lateness that a tick keeps: the camera's clock and the computer's differ by some ppm.
     const KEPT: f64 = 0.99;

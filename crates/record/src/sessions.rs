@@ -6,16 +6,16 @@ use crate::export::{Part, Source};
 use crate::reader::RunReader;
 use std::path::Path;
 
-/// The sessions of a run, and those whose folder cannot be read as one.
+/// The sessions of a run, and the folders that cannot be read as one.
 #[derive(Debug)]
 pub struct Sessions {
     /// In order; the first is the run's own folder.
     pub readers: Vec<(u64, RunReader)>,
-    /// Folders below `sessions/` that are no session, with the reason.
+    /// Folders below `sessions/` that are not sessions, with the reason.
     pub unreadable: Vec<String>,
 }
 
-/// The number that a session has by its `run.toml`; 1 for a run that knows no sessions.
+/// The number of a session in its `run.toml`; 1 for a run without sessions.
 fn number(reader: &RunReader) -> Option<u64> {
     let config = &reader.meta().ok()?.config;
     match config.get("session") {
@@ -34,7 +34,7 @@ fn pause_ns(reader: &RunReader) -> i64 {
         .and_then(|session| session.get("gap_s"))
         .and_then(toml::Value::as_float)
         .unwrap_or(0.0);
-    // A clock that was set back makes no negative pause.
+    // A clock that was set back must not give a negative pause.
     (gap_s.max(0.0) * 1e9) as i64
 }
 
@@ -42,7 +42,7 @@ impl Sessions {
     /// Finds the sessions of a run.
     ///
     /// # Errors
-    /// [`RecordError`] when the folder itself is no run.
+    /// [`RecordError`] if the folder itself is not a run.
     pub fn of(folder: &Path) -> Result<Self, RecordError> {
         let first = RunReader::open(folder)?;
         let mut found = Vec::new();
@@ -74,7 +74,7 @@ impl Sessions {
         })
     }
 
-    /// The sessions as one source of rows, laid on one axis of time: each begins a pause after the last row of the one before.
+    /// The sessions as one source of rows on one time axis: each begins after a pause behind the last row of the one before.
     ///
     /// # Errors
     /// [`RecordError`] when a session cannot be read.

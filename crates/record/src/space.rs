@@ -1,12 +1,12 @@
-//! Whether a run fits on the disk, asked before it begins.
+//! Checks before a run that it fits on the disk.
 
 use crate::columns::{Group, row_bytes};
 use crate::error::RecordError;
 use std::path::Path;
 
-/// Room for everything but ticks, and for what other programs write meanwhile, bytes.
+/// Room for everything but ticks, and for other programs' files meanwhile, bytes.
 const BESIDE: u64 = 32 << 20;
-/// What the frames of the batches add to a row, bytes.
+/// Bytes that the frames of the batches add to a row.
 const FRAME: u64 = 6;
 
 /// Bytes that a run of some ticks takes at most: its columns, the same again as Parquet, and a tenth for events and cycles.
@@ -16,7 +16,7 @@ pub fn needed_bytes(ticks: u64, columns: &[Group]) -> u64 {
     twice.saturating_add(twice / 10).saturating_add(BESIDE)
 }
 
-/// Bytes that this user may still write below a folder, which need not exist yet; None where nobody can tell.
+/// Bytes that this user may still write below a folder, which need not exist yet; None if unknown.
 pub fn free_bytes(folder: &Path) -> Option<u64> {
     let folder = std::path::absolute(folder).ok()?;
     let there = folder.ancestors().find(|folder| folder.exists())?;
@@ -28,7 +28,7 @@ pub fn free_bytes(folder: &Path) -> Option<u64> {
 /// begin.
 ///
 /// # Errors
-/// [`RecordError::NoSpace`] with what is needed and what is there.
+/// [`RecordError::NoSpace`] with the needed and the free space.
 pub fn check(root: &Path, ticks: Option<u64>, columns: &[Group]) -> Result<(), RecordError> {
     match free_bytes(root) {
         Some(free) => enough(root, free, ticks, columns),

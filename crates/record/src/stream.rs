@@ -1,8 +1,8 @@
 //! A tolerant reader of `ticks.arrow`.
 //!
-//! The format is Arrow's IPC stream, which any Arrow library reads when it is whole. This reader parses the messages itself. A
-//! file that is truncated or damaged must give every row around the damage, without a panic and without absurd memory. So every
-//! length is checked against the file first.
+//! The format is Arrow's IPC stream; any Arrow library reads a complete file. This reader parses the messages itself: from a
+//! truncated or damaged file it must give every row around the damage, without a panic and without excessive memory. So it checks
+//! every length against the file first.
 
 use crate::columns::{CHECK, COLUMNS, Column, Kind};
 use arrow_ipc::{MessageHeader, Type, root_as_message};
@@ -11,11 +11,11 @@ use std::io::{self, Read, Seek, SeekFrom};
 
 /// Marks the start of a message.
 const CONTINUATION: [u8; 4] = [0xff; 4];
-/// Longest description of a message that is believed.
+/// Longest accepted description of a message.
 const MAX_META: u64 = 1 << 20;
-/// Longest body of a message that is believed.
+/// Longest accepted body of a message.
 const MAX_BODY: u64 = 1 << 30;
-/// Bytes looked through at a time when searching for the next message after damage.
+/// Bytes per step of the search for the next message after damage.
 const SEARCH: usize = 1 << 16;
 
 /// Header of a message's rows.
@@ -41,7 +41,7 @@ struct Place {
     meaning: Meaning,
 }
 
-/// What a column of the file holds.
+/// Contents of a column of the file.
 #[derive(Clone, Copy)]
 enum Meaning {
     /// A value of the row.
@@ -54,7 +54,7 @@ enum Meaning {
     Unknown,
 }
 
-/// What a message turned out to be.
+/// Kind of a message.
 enum Message {
     /// The schema, or something without rows.
     NoRows,
@@ -64,7 +64,7 @@ enum Message {
     End,
 }
 
-/// Messages of a stream, one after the other, over any damage.
+/// Messages of a stream, one after the other, across any damage.
 pub(crate) struct Stream<R> {
     from: R,
     length: u64,
@@ -74,13 +74,13 @@ pub(crate) struct Stream<R> {
     references: ReferenceHistory,
     /// Rows whose check is wrong: never written, or damaged.
     pub(crate) damaged_rows: u64,
-    /// Bytes passed over because they made no sense, before a message that did.
+    /// Invalid bytes that were skipped before a valid message.
     pub(crate) damaged_bytes: u64,
-    /// Bytes after the last message that made sense: a batch cut off.
+    /// Bytes after the last valid message: a batch cut off.
     pub(crate) torn_bytes: u64,
     /// Whether the end mark was seen last.
     pub(crate) ended: bool,
-    /// Whether bytes at the end that make no message yet are waited for.
+    /// Whether incomplete bytes at the end may still become a message.
     follows: bool,
 }
 
@@ -117,7 +117,7 @@ impl<R: Read + Seek> Stream<R> {
         })
     }
 
-    /// Takes the file as long as it is now; what is at its end and no message yet is left for the next time.
+    /// Reads the file at its present length; an incomplete message at the end is left for the next time.
     pub(crate) fn follow(&mut self) -> io::Result<()> {
         self.length = self.from.seek(SeekFrom::End(0))?;
         self.follows = true;
@@ -246,8 +246,8 @@ impl<R: Read + Seek> Stream<R> {
         Ok(decode(&message, &body, &self.layout).map(|rows| (Message::Rows(rows), head.end)))
     }
 
-    /// The last row that a condition holds for. The batches before it are passed over by their lengths and not read, so
-    /// that the end of a night's recording is found in no time.
+    /// The last row that meets a condition. It skips earlier batches by their lengths without reading them, so it finds the end
+    /// of a long recording at once.
     ///
     /// # Errors
     /// Only when the file system refuses to read.
@@ -288,7 +288,7 @@ impl<R: Read + Seek> Stream<R> {
         Ok(None)
     }
 
-    /// The first position at or after `from` at which a message stands. Messages start at multiples of eight.
+    /// Position of the first message at or after `from`. Messages start at multiples of eight.
     fn search(&mut self, from: u64) -> io::Result<Option<u64>> {
         let mut base = from - from % 8;
         let mut block = vec![0u8; SEARCH];
@@ -306,7 +306,7 @@ impl<R: Read + Seek> Stream<R> {
                 .map(|(index, _)| base + index as u64 * 8)
                 .collect();
             for candidate in candidates {
-                // Two NaN in a row look like an end mark: only messages with content count here.
+                // Two NaN in a row look like an end mark, so only messages with content count here.
                 if let Some((Message::Rows(_) | Message::NoRows, _)) = self.message(candidate)? {
                     return Ok(Some(candidate));
                 }
@@ -366,7 +366,7 @@ fn decode(message: &arrow_ipc::Message, body: &[u8], layout: &[Place]) -> Option
         return None;
     }
     let rows = usize::try_from(batch.length()).ok()?;
-    // A row has at least one byte in the body, so that no length can ask for more memory than the file has bytes.
+    // A row has at least one byte in the body, so no length can require more memory than the file has bytes.
     if rows > body.len() {
         return None;
     }

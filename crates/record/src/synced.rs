@@ -1,7 +1,7 @@
-//! A file whose syncs wait on a separate thread, so that a slow disk never holds the recorder.
+//! A file with syncs on a separate thread, so that a slow disk never blocks the recorder.
 //!
-//! [`SyncedFile::unconfirmed`] tells how long the disk has not confirmed a write. The run decides whether that is too long
-//! ([`cellpos_runtime::recorder::Unconfirmed`]), which also has the argument.
+//! [`SyncedFile::unconfirmed`] gives the time for which the disk has not confirmed a write. The run decides whether that is too
+//! long; [`cellpos_runtime::recorder::Unconfirmed`] gives the reasons.
 
 use crate::blocks::Sink;
 use std::fs::File;
@@ -9,9 +9,9 @@ use std::io::{self, Seek, SeekFrom, Write};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// How long the end of a run waits for the disk.
+/// Longest wait for the disk at the end of a run.
 pub(crate) const LAST_PATIENCE: Duration = Duration::from_secs(15);
-/// A disk that works answers so soon when little is left to write. A dropped file does not wait for its last sync.
+/// A working disk with little to write answers within this time. A dropped file does not wait for its last sync.
 pub(crate) const DISK_ANSWERS: Duration = Duration::from_secs(2);
 
 #[derive(Default)]
@@ -20,7 +20,7 @@ struct State {
     asked: u64,
     done: u64,
     busy_since: Option<Instant>,
-    /// When a sync was asked for that waits for its turn.
+    /// Time of the request of a sync that waits for its turn.
     waiting_since: Option<Instant>,
     slowest: Duration,
     failed: Option<io::Error>,
@@ -39,7 +39,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until something holds, at most for a time; says whether it does.
+    /// Waits until a condition holds, at most for a time; returns whether it does.
     fn wait_until(&self, most: Duration, holds: impl Fn(&State) -> bool) -> bool {
         let (state, _) = self
             .changed
@@ -48,7 +48,7 @@ impl Shared {
         holds(&state)
     }
 
-    /// The thread: a sync whenever one was asked for, one for all that were asked for meanwhile.
+    /// The thread: one sync for all requests that have come meanwhile.
     fn serve(&self, sync: impl Fn() -> io::Result<()>) {
         let mut state = self.lock();
         loop {
@@ -85,7 +85,7 @@ impl Shared {
     }
 }
 
-/// A file that a separate thread syncs. That a sync failed is said by the next one.
+/// A file that a separate thread syncs. The next sync reports a failed one.
 pub(crate) struct SyncedFile {
     file: File,
     /// Made with the first sync.
@@ -97,8 +97,8 @@ impl SyncedFile {
         Self { file, shared: None }
     }
 
-    /// How long the disk has been at a sync without an answer. What is asked for while a sync runs waits for the next one: the
-    /// rows at stake may be older, by as long as the sync before took.
+    /// Time since the start of an unanswered sync. A request during a sync waits for the next one, so the unconfirmed rows may be
+    /// older by the duration of the sync before.
     pub(crate) fn unconfirmed(&self) -> Duration {
         let Some(shared) = &self.shared else {
             return Duration::ZERO;
@@ -194,7 +194,7 @@ impl Sink for SyncedFile {
 }
 
 impl Drop for SyncedFile {
-    /// The thread has the file open, and with it its lock: it is waited for, but not for a disk that hangs.
+    /// The thread has the file open and so holds its lock: wait for the thread, unless the disk hangs.
     fn drop(&mut self) {
         if let Some(shared) = &self.shared {
             shared.lock().closed = true;

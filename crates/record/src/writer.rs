@@ -1,4 +1,4 @@
-//! Writing a run while it runs.
+//! Writes a run during the run.
 
 use crate::blocks::{Blocks, Sink, open_here};
 use crate::columns::{self, Builder, Group};
@@ -17,12 +17,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// When rows go to the disk.
+/// The times at which rows go to the disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FlushPolicy {
     /// Rows in a full batch.
     pub rows: usize,
-    /// Longest time that a row waits; None: only full batches, so that the file is the same to the bit every time.
+    /// Longest time that a row waits; None: only full batches, so that the file is identical in every run.
     pub interval: Option<Duration>,
     /// Whether each flush waits until the disk has it (fdatasync).
     pub sync: bool,
@@ -50,9 +50,9 @@ pub struct Finished {
     pub folder: PathBuf,
     /// Rows written.
     pub rows: u64,
-    /// What could not be written.
+    /// The data that could not be written.
     pub faults: Faults,
-    /// The longest that the disk took to confirm what was written, where it was asked to.
+    /// Longest time that the disk took to confirm a write, if the policy syncs.
     pub slowest_sync: Option<Duration>,
     /// Whether `run.toml` has the end of the run.
     pub closed: bool,
@@ -67,7 +67,7 @@ pub struct RunWriter {
     pub(crate) log: Log<SyncedFile>,
 }
 
-/// Columns and events, with the account of what was lost.
+/// Columns and events, with counts of the losses.
 pub(crate) struct Log<S: Sink> {
     builder: Builder,
     encoder: StreamWriter<Vec<u8>>,
@@ -132,7 +132,7 @@ impl<S: Sink> Log<S> {
     fn fault(&mut self, error: &dyn std::fmt::Display) {
         self.io_errors += 1;
         if self.first.is_none() {
-            // Said once: a full disk would otherwise fill the log too.
+            // Log it only once: a full disk would otherwise fill the log too.
             tracing::error!("the record is incomplete: {error}; losses are counted");
             self.first = Some(error.to_string());
         }
@@ -169,7 +169,7 @@ impl<S: Sink> Log<S> {
         }
     }
 
-    /// Hands the rows gathered so far to the file, then the events that came with them.
+    /// Passes the rows gathered so far to the file, then the events that came with them.
     pub(crate) fn flush(&mut self) {
         let rows = self.builder.rows() as u64;
         if rows > 0 {
@@ -189,7 +189,7 @@ impl<S: Sink> Log<S> {
         self.write(self.policy.sync);
     }
 
-    /// Rows first: an event in the log is never without the ticks that it came with.
+    /// Rows first, so that the ticks of every logged event are in the file.
     fn write(&mut self, sync: bool) {
         self.last_flush = Instant::now();
         let mut attempt = || {
@@ -233,12 +233,12 @@ impl<S: Sink> Log<S> {
         self.ticks.bytes()
     }
 
-    /// Rows that were taken and are in memory only, as far as the disk has said.
+    /// Rows that are only in memory, as far as the disk has confirmed.
     pub(crate) fn unconfirmed_rows(&self) -> u64 {
         self.builder.rows() as u64 + self.ticks.waiting_units() + self.ticks.unconfirmed_units()
     }
 
-    /// Writes what waits and the end mark, and syncs; says whether the disk confirmed it.
+    /// Writes the waiting rows and the end mark, and syncs; returns whether the disk confirmed them.
     pub(crate) fn close(&mut self, most: Duration) -> bool {
         self.closed = true;
         self.flush();
@@ -250,7 +250,7 @@ impl<S: Sink> Log<S> {
         let until = Instant::now() + most;
         let mut answers = true;
         let settled = self.ticks.settle(most);
-        // The two share their time; a disk that has not answered the one is asked for the other all the same.
+        // Both share one time limit; the second sync is requested even if the disk has not answered the first.
         let left = until.saturating_duration_since(Instant::now());
         for settled in [settled, self.events.settle(left.max(DISK_ANSWERS))] {
             if let Err(error) = settled {
@@ -280,7 +280,7 @@ impl Log<SyncedFile> {
     }
 }
 
-/// Refuses what cannot be the name of a run.
+/// Refuses a name that a run cannot have.
 ///
 /// # Errors
 /// [`RecordError::Name`].
@@ -298,8 +298,8 @@ impl RunWriter {
     /// `meta.started_utc` is set here. The clock named in `meta` decides the [`FlushPolicy`].
     ///
     /// # Errors
-    /// [`RecordError`] when the folder cannot be made or the name cannot be one. A run that cannot be recorded at its
-    /// start should not begin.
+    /// [`RecordError`] if the folder cannot be made or the name is invalid. A run that cannot be recorded at its start
+    /// should not begin.
     pub fn create(root: &Path, meta: RunMeta) -> Result<Self, RecordError> {
         crate::space::check(root, None, &meta.columns)?;
         let policy = if meta.clock == "virtual" {
@@ -364,7 +364,7 @@ impl RunWriter {
         &self.meta
     }
 
-    /// Adds what is known of the conditions only once the run goes; it is written with the end.
+    /// Adds conditions that are known only during the run; they are written at the end.
     pub fn add_conditions(&mut self, conditions: toml::Table) {
         self.meta.conditions.extend(conditions);
     }
@@ -384,7 +384,7 @@ impl RunWriter {
         self.log.poll();
     }
 
-    /// Writes what waits, whatever its age.
+    /// Writes all waiting rows, whatever their age.
     pub fn flush(&mut self) {
         self.log.flush();
     }
@@ -394,13 +394,13 @@ impl RunWriter {
         self.log.faults()
     }
 
-    /// Rows that the disk has not confirmed. Rows that still gather for the next flush are among the rows; the time
-    /// counts from the flush.
+    /// Rows that the disk has not confirmed, including those that still gather for the next flush. The time counts from
+    /// the flush.
     pub fn unconfirmed(&self) -> Unconfirmed {
         self.log.unconfirmed()
     }
 
-    /// Whether the last attempt to write failed: what waits is tried again with the next batch.
+    /// Whether the last attempt to write failed; the next batch tries the waiting rows again.
     pub fn is_failing(&self) -> bool {
         self.log.failing
     }

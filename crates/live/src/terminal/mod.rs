@@ -1,15 +1,14 @@
-//! Messages and the live line on a terminal that nobody waits for.
+//! Messages and the live line on a terminal, without ever waiting for it.
 //!
-//! A terminal can stop taking output for as long as it likes: Ctrl-S, a stalled ssh connection, a pager. Only one
-//! thread writes to a [`Terminal`], fed by a ring of [`RING`] messages. A full ring drops the message and counts it; the
-//! terminal shows the number when it takes output again. So a thread that holds a rig, records or reacts to a signal never
-//! waits for a screen.
+//! A terminal can stop accepting output for any time: Ctrl-S, a stalled ssh connection, a pager. Only one thread writes to a
+//! [`Terminal`], fed by a ring of [`RING`] messages. A full ring drops the message and counts it; the terminal shows the number
+//! when it accepts output again. So a thread that controls a rig, records or handles a signal never waits for a screen.
 //!
 //! A view can take the whole terminal ([`Terminal::open_screen`]). Messages that arrive meanwhile are kept and shown when the
 //! view ends, however the program ends ([`give_back`]).
 //!
-//! All text is cleaned ([`clean`]): text from a file cannot move the cursor, rename the window or hide other
-//! text. The result of a command goes to standard output instead, when nothing waits any more.
+//! All text is cleaned ([`clean`]): text from a file cannot move the cursor, rename the window or hide other text. The result of
+//! a command goes to standard output instead, after all messages are written.
 //!
 //! ```
 //! use cellpos_live::terminal::{Colours, clean};
@@ -39,34 +38,34 @@ pub const RING: usize = 256;
 enum Message {
     /// A text that stays, with a line end.
     Say(String),
-    /// The line at the bottom, in place of the one before.
+    /// Replaces the line at the bottom.
     Show(String),
-    /// The line at the bottom is not replaced any more.
+    /// Keeps the line at the bottom; it is not replaced any more.
     Leave,
-    /// Says when everything before it has been written.
+    /// Reports when everything before it has been written.
     Flush(SyncSender<()>),
     /// The whole terminal is taken.
     Open,
-    /// A picture on it, as it is.
+    /// A picture for it, written unchanged.
     Draw(String),
     /// It is given back.
     Close,
 }
 
-/// A terminal, or what takes its place.
+/// A terminal, or its substitute.
 #[derive(Debug, Clone)]
 pub struct Terminal {
     ring: SyncSender<Message>,
     dropped: Arc<AtomicU64>,
-    /// Pictures that are not on the terminal yet.
+    /// Pictures not yet written.
     pending: Arc<AtomicU64>,
-    /// What was said last while the whole terminal was taken; known to the threads of terminal and picture alone.
+    /// The last message while a view uses the whole terminal; only the threads of terminal and picture use it.
     heard: Arc<Mutex<String>>,
 }
 
 impl Terminal {
-    /// A thread that writes to `out`. It ends when the last handle is gone, and does not keep the program from ending. Where
-    /// no thread can be started everything is dropped and counted.
+    /// A thread that writes to `out`. It ends with the last handle, and does not prevent the end of the program. If no thread can
+    /// be started, everything is dropped and counted.
     pub fn new(out: impl Write + Send + 'static) -> Self {
         Self::with(out, Screen::default())
     }
@@ -101,28 +100,27 @@ impl Terminal {
         }
     }
 
-    /// A separate message; a line end is added. Never waits.
+    /// Writes a message; adds a line end. Never waits.
     pub fn say(&self, text: &str) {
         self.send(Message::Say(text.to_string()));
     }
 
-    /// The live line, in place of the one before; empty: none any more. Never waits.
+    /// Replaces the live line; empty: removes it. Never waits.
     pub fn show(&self, line: &str) {
         self.send(Message::Show(line.to_string()));
     }
 
-    /// The live line stays as it is, and the next one comes below it. Never waits.
+    /// Keeps the live line; the next one comes below it. Never waits.
     pub fn leave(&self) {
         self.send(Message::Leave);
     }
 
-    /// Takes the whole terminal: pictures are drawn on it, the live line is not shown, and what is said is kept until
-    /// [`Terminal::close_screen`].
+    /// Takes the whole terminal for pictures. The live line is hidden, and messages are kept until [`Terminal::close_screen`].
     pub fn open_screen(&self) {
         self.send(Message::Open);
     }
 
-    /// Whether the last picture is on the terminal: another one need not be made before.
+    /// Whether the last picture is on the terminal. Before that, no new one is needed.
     pub fn can_draw(&self) -> bool {
         self.pending.load(Ordering::Acquire) == 0
     }
@@ -137,25 +135,25 @@ impl Terminal {
         taken
     }
 
-    /// What was said last while the terminal was taken.
+    /// The last message while a view uses the terminal.
     pub fn heard(&self) -> String {
         let heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
         heard.clone()
     }
 
-    /// Gives the terminal back and tells what was said meanwhile. A terminal that takes nothing is waited for no longer than
-    /// `patience`.
+    /// Releases the terminal and writes the messages kept meanwhile. Waits at most `patience` for a terminal that accepts
+    /// nothing.
     pub fn close_screen(&self, patience: Duration) {
         self.send(Message::Close);
         self.flush(patience);
     }
 
-    /// Messages that found the ring full and have not been told of yet.
+    /// Messages dropped by a full ring and not reported yet.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
 
-    /// Waits until everything said so far is written, for `patience` at most; says whether it is.
+    /// Waits until all messages so far are written, at most `patience`; returns whether they are.
     pub fn flush(&self, patience: Duration) -> bool {
         let (done, written) = sync_channel(1);
         self.ring.try_send(Message::Flush(done)).is_ok() && written.recv_timeout(patience).is_ok()
@@ -190,11 +188,11 @@ pub fn size() -> (u16, u16) {
         .unwrap_or((80, 24))
 }
 
-/// Sends the words of a panic to [`stderr`], so that a thread that fails does not wait for a screen before it is noticed.
+/// Sends the message of a panic to [`stderr`], so that a failing thread does not wait for a screen before it is noticed.
 pub fn panics_do_not_wait() {
     let plain = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
-        // The program ends with its main thread: nobody would be left to write.
+        // The program ends with its main thread, so no thread could write the message later.
         if thread::current().name() == Some("main") {
             give_back();
             plain(info);
@@ -221,7 +219,7 @@ impl<W: Write> Writer<W> {
                 Err(RecvTimeoutError::Timeout) => Ok(()),
                 Err(RecvTimeoutError::Disconnected) => return,
             };
-            // A terminal that is gone for good: what comes is dropped and counted.
+            // The terminal is gone: further messages are dropped and counted.
             if written.is_err_and(|error| error.kind() == io::ErrorKind::BrokenPipe) {
                 return;
             }
@@ -303,9 +301,9 @@ impl Write for Log {
 /// What happens to sequences that set colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Colours {
-    /// They stay: they change how text looks, nothing else.
+    /// They are kept: they change only the look of text.
     Kept,
-    /// They go, like all others.
+    /// They are removed, like all others.
     Removed,
 }
 
@@ -351,7 +349,7 @@ mod tests {
     use super::*;
     use std::sync::Condvar;
 
-    /// A terminal that takes output only while it is let.
+    /// A terminal that accepts output only while the test allows it.
     #[derive(Clone, Default)]
     struct Screen(Arc<Shown>);
 
@@ -392,7 +390,7 @@ mod tests {
     fn nobody_waits_for_a_terminal_that_takes_no_output_and_what_is_dropped_is_told() {
         let screen = Screen::default();
         let terminal = Terminal::new(screen.clone());
-        // The terminal takes nothing: were anything of this to wait for it, the test would never end.
+        // The terminal accepts nothing: if any call waited for it, the test would never end.
         for number in 0..10_000 {
             terminal.show(&format!("line {number}"));
             terminal.say("an event");

@@ -1,4 +1,4 @@
-//! Text for people: how units are written is given by the program.
+//! Text for people; the program provides the spelling of units.
 
 use std::borrow::Cow;
 use std::sync::OnceLock;
@@ -8,7 +8,7 @@ type Typeset = fn(&str) -> String;
 
 static TYPESET: OnceLock<Typeset> = OnceLock::new();
 
-/// From now on text for people goes through `typeset`: for a standard error that is a terminal with letters beyond ASCII. Only
+/// From now on text for people passes through `typeset`. For a terminal on standard error that shows letters beyond ASCII. Only
 /// the first call counts.
 pub fn typeset_with(typeset: Typeset) {
     let _ = TYPESET.set(typeset);

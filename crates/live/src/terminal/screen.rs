@@ -1,4 +1,4 @@
-//! The whole terminal, taken for a while.
+//! The use of the whole terminal for a view.
 
 use std::collections::VecDeque;
 use std::io::{self, Write};
@@ -12,10 +12,10 @@ use std::time::Duration;
 const TAKE: &str = "\x1b[?1049h\x1b[?25l\x1b[2J\x1b[H";
 /// Gives it back.
 const GIVE: &str = "\x1b[0m\x1b[?25h\x1b[?1049l";
-/// Messages that are kept while it is taken.
+/// Most messages kept while a view uses it.
 const KEPT: usize = 200;
 
-/// Whether the terminal behind standard error is taken.
+/// Whether a view uses the terminal behind standard error.
 static STDERR: OnceLock<Arc<AtomicBool>> = OnceLock::new();
 
 /// Releases the terminal behind standard error if it is taken. For ends of the program that skip the normal path: a signal that
@@ -40,7 +40,7 @@ pub fn give_back() {
 #[derive(Debug, Default)]
 pub(crate) struct Screen {
     open: bool,
-    /// Whether it is still taken: [`give_back`] may have given it back.
+    /// Whether a view still uses it: [`give_back`] may have released it.
     taken: Arc<AtomicBool>,
     kept: VecDeque<String>,
 }
@@ -61,7 +61,7 @@ impl Screen {
         out.write_all(TAKE.as_bytes()).and_then(|()| out.flush())
     }
 
-    /// Shows a picture, unless the terminal was given back meanwhile.
+    /// Shows a picture, unless the terminal was released meanwhile.
     pub(crate) fn draw(&self, out: &mut impl Write, picture: &str) -> io::Result<()> {
         if !self.open || !self.taken.load(Ordering::Acquire) {
             return Ok(());
@@ -69,7 +69,7 @@ impl Screen {
         out.write_all(picture.as_bytes()).and_then(|()| out.flush())
     }
 
-    /// Keeps what is said; of too much the oldest goes.
+    /// Keeps a message; drops the oldest if there are too many.
     pub(crate) fn keep(&mut self, text: &str) {
         if self.kept.len() == KEPT {
             self.kept.pop_front();
@@ -77,7 +77,7 @@ impl Screen {
         self.kept.push_back(text.to_string());
     }
 
-    /// Gives the terminal back; what was said meanwhile.
+    /// Releases the terminal; returns the messages kept meanwhile.
     pub(crate) fn close(&mut self, out: &mut impl Write) -> io::Result<VecDeque<String>> {
         if std::mem::take(&mut self.open) && self.taken.swap(false, Ordering::AcqRel) {
             out.write_all(GIVE.as_bytes()).and_then(|()| out.flush())?;

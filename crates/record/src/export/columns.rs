@@ -1,4 +1,4 @@
-//! What other programs see of a run: the columns, under the same names in every form, with unit and meaning.
+//! The columns of a run for other programs, with unit and meaning, under the same names in every format.
 
 use cellpos_runtime::{LAW_COLUMNS, TickRecord};
 
@@ -36,7 +36,7 @@ pub struct Column<'a> {
     pub unit: &'static str,
     /// Meaning, in a sentence.
     pub about: &'static str,
-    /// How it is read off a row.
+    /// How to read it from a row.
     pub value: Value,
 }
 
@@ -76,7 +76,7 @@ pub(crate) fn seconds(ns: i64) -> f64 {
     ns as f64 / 1e9
 }
 
-/// Position of the bead as far as it is one.
+/// Position of the bead, if it is valid.
 pub(crate) fn bead_um(tick: &TickRecord) -> f64 {
     if tick.verdict == 0 {
         tick.measured_um
@@ -276,7 +276,7 @@ fn law<const INDEX: usize>(row: &Row) -> f64 {
     row.tick.law.get(INDEX).map_or(f64::NAN, |v| f64::from(*v))
 }
 
-/// The values of a control law's own columns, by their place in a row.
+/// The values of a control law's columns, by their place in a row.
 const LAW: [fn(&Row) -> f64; LAW_COLUMNS] = [
     law::<0>, law::<1>, law::<2>, law::<3>, law::<4>, law::<5>, law::<6>, law::<7>,
 ];
@@ -314,7 +314,7 @@ pub const OF_LAWS: &[(&str, &str)] = &[
     ),
 ];
 
-/// Columns of the control law's own, in the order of their names in the metadata; at most as many as a row has room for.
+/// Columns of the control law, in the order of their names in the metadata, at most as many as fit into a row.
 pub fn of_law(names: &[String]) -> Vec<Column<'_>> {
     let unit = |name: &str| {
         let units = ["um", "s", "us", "hz", "deg"];

@@ -11,7 +11,7 @@ pub fn csv_head() -> String {
     names.join(",")
 }
 
-/// Writes the rows of a run as CSV. Numbers read back to the same bits; what does not exist is an empty field.
+/// Writes the rows of a run as CSV. Numbers read back to the same bits; a missing value is an empty field.
 ///
 /// # Errors
 /// When `out` refuses, or the run cannot be opened.

@@ -1,6 +1,6 @@
 //! A run as a MAT-file of version 5: one variable per column, for MATLAB, Octave and SciPy.
 //!
-//! The rows are counted first, so that every variable has its place in the file before its values come, some rows of all
+//! It counts the rows first, so that every variable has its place in the file. Then it writes the values, some rows of all
 //! variables at a time.
 
 use super::columns::{Column, Row, Value, listed, word};
@@ -25,8 +25,8 @@ mod code {
     pub(super) const CLASS_DOUBLE: u32 = 6;
 }
 
-/// Writes the rows of a run as a MAT-file, in one step. Words are their numbers; the variable `codes_<column>` says which is
-/// which.
+/// Writes the rows of a run as a MAT-file, in one step. A word is written as its number; the variable `codes_<column>` lists
+/// them.
 ///
 /// # Errors
 /// [`RecordError`] names the file; more rows than the format can hold are refused.

@@ -124,7 +124,7 @@ impl Selection {
 pub struct Exported {
     /// Rows written.
     pub rows: u64,
-    /// What is not there, for each session.
+    /// The missing rows of each session.
     pub lost: Vec<Lost>,
 }
 
@@ -170,7 +170,7 @@ impl Source {
             Err(error) => Err(RecordError::io("cannot read", path)(error)),
             Ok(text) => {
                 let whole = crate::whole_text(&text);
-                // A head without rows is no table yet.
+                // A head without rows is not a table yet.
                 let rows = whole.lines().count() > 1;
                 Ok(rows.then(|| (path, whole.to_owned())))
             }
@@ -190,10 +190,10 @@ impl Source {
         Ok(all)
     }
 
-    /// Hands over the rows wanted, some at a time, so that a night's run needs no night's memory.
+    /// Passes on the requested rows in pieces, so that memory does not grow with the length of a run.
     ///
     /// # Errors
-    /// [`RecordError`] when a session cannot be read or has nothing in the time that was asked for, or what `take` refuses.
+    /// [`RecordError`] if a session cannot be read or has no rows in the requested time, and any error of `take`.
     pub fn rows(
         &self,
         selection: &Selection,
@@ -250,7 +250,7 @@ impl Source {
         }
     }
 
-    /// Where a session has the control law's columns of the whole run; None where all sessions have the same ones.
+    /// Places of the whole run's control-law columns in a session; None if all sessions have the same ones.
     fn places(&self, part: &Part) -> Result<Option<[Option<usize>; LAW_COLUMNS]>, RecordError> {
         let own = part.reader.law_columns();
         if own == self.law {
@@ -267,7 +267,7 @@ impl Source {
     }
 }
 
-/// Writes a run to a file in one step: a reader never sees half of it.
+/// Writes a run to a file in one step: a reader never sees half a file.
 ///
 /// # Errors
 /// [`RecordError`] names the file.
@@ -304,12 +304,12 @@ pub fn export(
     }
 }
 
-/// Whether there is something of this name that is no file: a device or a pipe, which nothing may take the place of.
+/// Whether the name belongs to a device or a pipe, which no file may replace.
 fn is_device(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir())
 }
 
-/// Gives a file that is written whole its name. A device or a pipe gets the bytes and is not replaced.
+/// Renames a complete temporary file to its final name. A device or a pipe gets the bytes and is not replaced.
 fn settle(part: &Path, path: &Path) -> io::Result<()> {
     if !is_device(path) {
         return std::fs::rename(part, path);

@@ -1,4 +1,4 @@
-//! A run as Apache Parquet: numbers that do not exist are null, words are dictionaries, unit and meaning are with each column.
+//! A run as Apache Parquet: missing numbers are null, words are dictionaries, and each column has its unit and meaning.
 
 use super::columns::{Column, Row, Value, listed, word};
 use super::{Exported, Selection, Source, whole};
@@ -61,8 +61,8 @@ pub fn write_parquet(
     })
 }
 
-/// How the columns are laid out, by the first rows: a number that seldom repeats gets no dictionary, which would hold nearly every
-/// value; a whole number that always grows (a tick, a time) is kept as its steps.
+/// Encoding of the columns, chosen by the first rows. A number that seldom repeats gets no dictionary, which would hold nearly
+/// every value. A whole number that always grows (a tick, a time) is stored as its steps.
 fn layout(columns: &[Column<'_>], rows: &[Row]) -> WriterProperties {
     let mut layout = WriterProperties::builder().set_max_row_group_row_count(Some(ROW_GROUP));
     for column in columns {
@@ -110,7 +110,7 @@ fn schema(columns: &[Column<'_>], source: &Source) -> SchemaRef {
     about.insert("cellpos.format".to_owned(), crate::FORMAT.to_string());
     if let Some(meta) = source.meta() {
         about.insert("cellpos.run".to_owned(), meta.name.clone());
-        // On the virtual clock a seed fixes every bit, the time of the day does not belong to it.
+        // On the virtual clock a seed fixes every bit, so the time of day is left out.
         if meta.clock != "virtual" {
             about.insert("cellpos.started_utc".to_owned(), meta.started_utc.clone());
         }

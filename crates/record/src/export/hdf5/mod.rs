@@ -1,6 +1,6 @@
-//! A run as one HDF5 file: `/ticks` and `/cycles` with a dataset a column, `/events`, the metadata as text.
+//! A run as one HDF5 file: `/ticks` and `/cycles` with one dataset per column, `/events`, and the metadata as text.
 //!
-//! The one place that knows the HDF5 library. Deflate is the only filter that all readers of the field have.
+//! Only this module knows the HDF5 library. Deflate is the only filter that all readers of the field have.
 
 mod rtdc;
 
@@ -17,13 +17,13 @@ use hdf5_pure::{
 };
 use std::path::Path;
 
-/// Rows of a chunk, and rows held in memory. The library encodes a chunk's rows in 1, 2, 4 or 8 bytes; HDF5 2.0 refuses a file
-/// in which they are not as few as can be, which is three from 65 536 rows on.
+/// Rows of a chunk, and rows held in memory. The library encodes a chunk's rows in 1, 2, 4 or 8 bytes. HDF5 2.0 requires the
+/// fewest possible bytes, and refuses the file otherwise; from 65 536 rows on that would be three.
 const CHUNK: usize = 1 << 15;
 const _: () = assert!(CHUNK <= u16::MAX as usize);
 /// The number for a missing word.
 const NO_WORD: u8 = 255;
-/// How hard to deflate: numbers of a measurement gain little from more.
+/// Level of deflate: a higher one gains little on measured numbers.
 const LEVEL: u32 = 1;
 
 fn encode(error: &dyn std::fmt::Display) -> RecordError {
@@ -182,7 +182,7 @@ fn described(dataset: &mut DatasetBuilder, column: &Column<'_>) {
     }
 }
 
-/// Columns of a table: numbers where all fields are numbers or empty, text otherwise.
+/// Columns of a table: numbers if all fields are numbers or empty, else text.
 fn table(group: &mut GroupBuilder, table: &Table) -> Result<(), RecordError> {
     for (place, name) in table.names.iter().enumerate() {
         let number = |field: &str| match field {

@@ -1,5 +1,5 @@
-//! The cells of a run in the format of real-time deformability cytometry (`.rtdc`), which dclab and Shape-Out read: one event
-//! for each frame in which the cell was measured.
+//! The cells of a run in the format of real-time deformability cytometry (`.rtdc`), for dclab and Shape-Out. Each frame with a
+//! measured cell is one event.
 //!
 //! Deformation is not in it: the loop measures length and area of a cell, not its perimeter.
 
@@ -11,7 +11,7 @@ use crate::meta::RunMeta;
 use hdf5_pure::{AttrValue, File, FileAccessProperties, FileBuilder, MaxExtent, SyncPolicy};
 use std::path::Path;
 
-/// A feature: its name in the format, and how it is read off a row.
+/// A feature: its name in the format, and how to read it from a row.
 type Feature = (&'static str, fn(&Row) -> f64);
 
 /// The features, by the names that the format knows.
@@ -30,8 +30,8 @@ const FEATURES: [Feature; 7] = [
 /// Writes the cells of a run as `.rtdc`, in one step.
 ///
 /// # Errors
-/// [`RecordError`] names the file; a run in which no cell was measured, or of which the format's questions about sample, chip
-/// and imaging have no answer, is refused with what is missing.
+/// [`RecordError`] names the file. A run without a measured cell, or without the format's required data on sample, chip and
+/// imaging, is refused; the error names what is missing.
 pub fn write_rtdc(
     source: &Source,
     selection: &Selection,
@@ -83,16 +83,16 @@ pub fn write_rtdc(
 #[derive(Debug, Default)]
 struct Events {
     count: u64,
-    /// Where the path so far ends: time \[s\], position \[um\].
+    /// End of the path so far: time \[s\], position \[um\].
     last: Option<(f64, f64)>,
     path_um: f64,
     path_s: f64,
 }
 
 impl Events {
-    /// Points of the path are this far apart, s: noise of the position, some 20 nm, makes no more than 2 um/s.
+    /// Spacing of the points of the path, s: position noise of some 20 nm then adds at most 2 um/s.
     const STEP_S: f64 = 0.01;
-    /// A longer pause, of a lost cell or between two sessions, is no part of the path, s.
+    /// A longer pause, s, of a lost cell or between two sessions, is not part of the path.
     const PAUSE_S: f64 = 0.1;
 
     fn add(&mut self, row: &Row) {
@@ -125,8 +125,8 @@ impl Events {
     }
 }
 
-/// Flow through a square channel at a speed, ul/s. The PZT moves the medium to and fro: this is its mean amount. The format
-/// refuses a flow of nothing, so that a cell at rest has the smallest of all.
+/// Flow through a square channel at a speed, ul/s. The PZT moves the medium to and fro: this is its mean absolute value. The
+/// format refuses a flow of zero, so a cell at rest gets the smallest number.
 fn flow_ul_per_s(speed_um_per_s: f64, width_um: f64) -> f64 {
     const UL_PER_UM3: f64 = 1e-9;
     (speed_um_per_s * width_um * width_um * UL_PER_UM3).max(f64::MIN_POSITIVE)
@@ -187,7 +187,7 @@ fn number(table: &toml::Table, keys: &[&str]) -> Option<f64> {
         .or_else(|| value.as_integer().map(|whole| whole as f64))
 }
 
-/// What the format asks of a measurement.
+/// The format's required data of a measurement.
 fn attributes(meta: &RunMeta, all: &Events) -> Result<Vec<(&'static str, AttrValue)>, RecordError> {
     let config = &meta.config;
     let text = |key: &str| {
