@@ -11,19 +11,20 @@ pub struct Config {
     pub limits: Limits,
     /// Rate of a ramp to park, nm/s.
     pub ramp_nm_per_s: u32,
-    /// Displacement after power-up, until the first session, pm: where the converter stands when it is switched on.
+    /// Displacement after power-up, until the first session, pm: the converter's output when it is switched on.
     pub power_up_pm: i32,
-    /// Where a ramp to park ends unless the host says otherwise, pm.
+    /// Displacement at the end of a ramp to park, unless the host sets another, pm.
     pub park_pm: i32,
     /// Bits of the converter, 8..=16.
     pub dac_bits: u8,
     /// Period of the output's updates while it moves, us.
     pub update_us: u32,
-    /// Default time without a fresh command after which the output goes to the zero-flow displacement, ms.
+    /// Default time without a new command after which the output moves to the zero-flow displacement, ms.
     pub watchdog_ms: u16,
-    /// Default time that it is then held, and that a freeze or an armed board waits, before the ramp to park, ms.
+    /// Default holding time before the ramp to park, ms: after that move, in a freeze, and for an armed board without a
+    /// command.
     pub hold_watchdog_ms: u16,
-    /// Longest time that a host may ask for in either place, ms.
+    /// Longest time that a host may request for either, ms.
     pub longest_watchdog_ms: u16,
     /// A command that took this much longer than the fastest one counts as late, us.
     pub late_us: u32,
@@ -62,7 +63,7 @@ impl Config {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] for the first value that cannot be.
+    /// [`ConfigError`] for the first invalid value.
     pub const fn validate(&self) -> Result<(), ConfigError> {
         const FARTHEST_PM: i32 = 2_000_000_000;
         let Limits {
@@ -106,7 +107,7 @@ impl Default for Config {
     }
 }
 
-/// What of a [`Config`] cannot be.
+/// The invalid value of a [`Config`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ConfigError {
     /// The range is empty or reaches beyond +-2000 um.

@@ -1,7 +1,7 @@
 //! The PZT board's state machine, used unchanged by the emulated rig, by `firmware-sim` and by real firmware.
 //!
-//! [`Board`] is fed with bytes and times and yields bytes and the converter's code. No standard library, no allocation, no
-//! clock, no floating point: displacements are whole picometres, times microseconds since the board's start.
+//! A [`Board`] takes bytes and times, and returns bytes and the converter's code. No standard library, no allocation, no clock,
+//! no floating point: displacements are whole picometres, times microseconds since the board's start.
 //!
 //! ```
 //! use cellpos_board::{Board, Config};

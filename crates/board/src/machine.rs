@@ -1,9 +1,9 @@
 //! The state machine: the reaction of the board to each message and to the passing of time.
 //!
-//! The board trusts nobody: it enforces range and slew itself, ignores commands that are old, doubled, reordered or of
-//! another session, and answers silence in two stages. First it goes to the host's last estimate of the zero-flow displacement
-//! and holds it: the bead almost stops. A host that returns continues with its next command.
-//! If none comes, it ramps to park and stays there until it is armed again.
+//! The board trusts no host. It enforces range and slew itself, and ignores commands that are old, doubled, reordered or of
+//! another session. It reacts to silence in two stages. First it moves to the host's last estimate of the zero-flow displacement
+//! and holds it, so the bead almost stops. A host that returns continues with its next command. If no command comes, the board
+//! ramps to park and stays there until it is armed again.
 //!
 //! | state | output | left by |
 //! |---|---|---|
@@ -25,7 +25,7 @@ use cellpos_link::{
 
 /// Firmware version reported in the identity.
 pub const FIRMWARE_VERSION: [u8; 3] = [0, 2, 0];
-/// Between unsolicited status messages while no command is answered, us.
+/// Interval of unsolicited status messages while no command is answered, us.
 const STATUS_PERIOD_US: u64 = 10_000;
 /// Longest stretch between two commands that interpolation bridges, us.
 const LONGEST_BRIDGE_US: u64 = 5_000;
@@ -47,7 +47,7 @@ pub struct Board {
     returning: bool,
     led: bool,
     now_us: u64,
-    /// When the hold watchdog was last fed.
+    /// Time at which the hold watchdog was last fed.
     held_since_us: u64,
     next_status_us: u64,
     ignored: u32,
@@ -56,7 +56,7 @@ pub struct Board {
 }
 
 impl Board {
-    /// A board that has just been switched on at time 0: disarmed, at the power-up displacement.
+    /// A board that was just switched on at time 0: disarmed, at the power-up displacement.
     ///
     /// # Errors
     /// [`ConfigError`] names the first value that cannot be.
@@ -85,10 +85,10 @@ impl Board {
     }
 
     /// A board whose microcontroller was reset while its converter showed `applied_pm`. No host controls the bead from there, so
-    /// the output first ramps to park. It is armed when it has arrived.
+    /// the output first ramps to park. It can be armed after it has arrived.
     ///
     /// # Errors
-    /// [`ConfigError`] names the first value that cannot be; a displacement outside the range is one.
+    /// [`ConfigError`] names the first invalid value, also a displacement outside the range.
     pub fn after_reset(config: Config, applied_pm: i32) -> Result<Self, ConfigError> {
         let stands = Config {
             power_up_pm: applied_pm,
@@ -103,7 +103,7 @@ impl Board {
 
     /// Takes bytes that arrived at `now_us`. The output follows at the next [`Board::tick`].
     ///
-    /// A time before the last one is taken as the last one: the board's clock does not run backwards.
+    /// A time before the last one counts as the last one: the board's clock does not run backwards.
     pub fn receive(&mut self, bytes: &[u8], now_us: u64) {
         self.now_us = self.now_us.max(now_us);
         self.watch();
@@ -115,8 +115,8 @@ impl Board {
 
     /// Brings the output up to `now_us`; returns the code that the converter shows from now on.
     ///
-    /// To be called every [`Config::update_us`] while the output moves. If calls come further apart, the output still moves by at
-    /// most the slew of one update period per call. So a stalled board slows down and does not jump.
+    /// Call it every [`Config::update_us`] while the output moves. If calls come further apart, the output still moves by at most
+    /// the slew of one update period per call. So a stalled board slows down and does not jump.
     pub fn tick(&mut self, now_us: u64) -> u16 {
         self.now_us = self.now_us.max(now_us);
         self.watch();
@@ -184,7 +184,7 @@ impl Board {
         &self.config
     }
 
-    /// How things stand, as sent to the host.
+    /// The status for the host.
     pub fn status(&self) -> Status {
         let applied_pm = self.output.applied_pm();
         Status {
@@ -212,7 +212,7 @@ impl Board {
         self.returning &= !self.output.arrived(target_pm);
     }
 
-    /// Where the output has to go in the present state (pm), and how fast (nm/s).
+    /// Target (pm) and rate (nm/s) of the output in the present state.
     fn target(&self) -> (i32, u32) {
         let session = &self.session;
         let slew = session.limits.slew_nm_per_s;
@@ -271,7 +271,7 @@ impl Board {
         });
     }
 
-    /// Goes to the last zero-flow estimate and waits there from `since_us` on for as long as the hold watchdog allows.
+    /// Moves to the last zero-flow estimate and waits there, from `since_us` on, as long as the hold watchdog allows.
     fn hold(&mut self, state: BoardState, since_us: u64) {
         let applied_pm = self.output.applied_pm();
         let hold_pm = self.session.neutral_pm.unwrap_or(applied_pm);
@@ -361,7 +361,7 @@ impl Board {
         if self.returning {
             return Err(Refusal::State);
         }
-        // A host whose commands are fresh is at work: it has to end its session first, or fall silent.
+        // A host with fresh commands is active: it must end its session first, or fall silent.
         if self.state == BoardState::Running && arm.session != self.session.number {
             return Err(Refusal::Busy);
         }
@@ -424,7 +424,7 @@ impl Board {
         self.session.last_time_us = command.time_us;
         self.session.last_command_us = self.now_us;
         self.session.neutral_pm = Some(self.session.within(command.neutral_pm));
-        // A host that takes up again within the hold watchdog has ended the fault.
+        // A host that resumes within the hold watchdog's time ends the fault.
         self.fault = Fault::None;
         self.state = BoardState::Running;
         if self.session.status_is_due() {

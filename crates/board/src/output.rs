@@ -1,4 +1,4 @@
-//! The output stage: where the output is to be, and how it gets there within range, slew and converter steps.
+//! The output stage: the target of the output, and its motion within range, slew and converter steps.
 //!
 //! All numbers are integers: rates in nm/s, times in us, displacements before the converter in fm. So the slew of one microsecond
 //! at 1 nm/s is still 1 fm.
@@ -9,7 +9,7 @@ use core::num::NonZeroU64;
 /// Femtometres in a picometre.
 const FM: i64 = 1_000;
 
-/// Where the output is to be as a function of time: a straight line, then level.
+/// Target of the output as a function of time: a straight line, then constant.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Trajectory {
     from_pm: i32,

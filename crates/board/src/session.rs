@@ -1,4 +1,4 @@
-//! State of one session: limits, watchdog times, and which commands are fresh.
+//! State of one session: limits, watchdog times, and the test whether a command is new.
 
 use crate::Config;
 use cellpos_link::{Arm, Command, Limits, Order, Refusal, order};
@@ -18,14 +18,14 @@ pub(crate) struct Session {
     pub(crate) last_time_us: u64,
     pub(crate) last_command_us: u64,
     pub(crate) neutral_pm: Option<i32>,
-    /// How often the output went to the zero-flow displacement because commands stopped.
+    /// Number of moves to the zero-flow displacement because commands stopped.
     pub(crate) holds: u16,
-    /// Smallest transit time seen so far, ns, and when (us): what longer ones are compared with.
+    /// Smallest transit time so far, ns, and its time (us): the reference for longer ones.
     fastest: Option<(i64, u64)>,
 }
 
 impl Session {
-    /// What counts before the first arming.
+    /// The values before the first arming.
     pub(crate) fn before_any(config: &Config) -> Self {
         Self {
             number: 0,
@@ -109,7 +109,7 @@ impl Session {
         transit_ns > floor_ns.saturating_add(i64::from(late_us) * 1000)
     }
 
-    /// Counts a command; whether a status is due after it.
+    /// Counts a command; returns whether a status is due after it.
     pub(crate) fn status_is_due(&mut self) -> bool {
         self.since_status = self.since_status.saturating_add(1);
         self.status_every > 0 && self.since_status >= self.status_every

@@ -1,4 +1,4 @@
-//! Bytes waiting to be collected for the host.
+//! Bytes that wait for the host.
 
 use cellpos_link::{MAX_FRAME, ToHost, encode};
 

@@ -1,7 +1,7 @@
-//! Frames of the empty channel, against which cells are seen: recorded once per setting of the camera, kept as a stack.
+//! Frames of the empty channel, from which vision separates cells: recorded once per setting of the camera, kept as a stack.
 //!
-//! The frames are kept, not only their mean. Their scatter is the noise that decides what counts as a cell, and a frame in which
-//! something swam past is found and named.
+//! All frames are kept, not only their mean. Their scatter is the noise that sets the threshold for a cell, and frames with a
+//! passing object are found and named.
 
 use crate::sources::{self, SourceError};
 use cellpos_rig::source::FrameBuffer;
@@ -10,7 +10,7 @@ use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 use tiff::encoder::{TiffEncoder, colortype};
 
-/// Why there is no background.
+/// The reason why there is no background.
 #[derive(Debug, thiserror::Error)]
 pub enum BackgroundError {
     /// The recording cannot be read.
@@ -47,9 +47,9 @@ pub enum BackgroundError {
         from: String,
         /// Which, from 0.
         frame: usize,
-        /// Where the difference is, px.
+        /// Position of the difference, px.
         x_px: f64,
-        /// Where the difference is, px.
+        /// Position of the difference, px.
         y_px: f64,
         /// Its area, px.
         area_px: f64,

@@ -12,12 +12,12 @@ use cellpos_rig::{
 };
 use std::time::Duration;
 
-/// How long an answer to a request may take.
+/// Longest time until the answer to a request.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
 /// Longest time until the answer to the first hello. A board that resets when its port is opened, or a line that wakes up slowly
 /// (a pseudo-terminal of QEMU looks once a second), is silent at first.
 const HELLO_WITHIN: Duration = Duration::from_secs(3);
-/// How often a request is sent again within that time.
+/// Interval between repetitions of a request within that time.
 const REPEAT_EVERY: Duration = Duration::from_millis(50);
 
 fn state_of(state: BoardState) -> ActuatorState {
@@ -85,7 +85,7 @@ pub struct BoardHost<P> {
     seq: u32,
     first_seq: u32,
     account: CommandAccount,
-    /// Newest command that a status of this session has named as obeyed.
+    /// Newest command that a status of this session names as obeyed.
     answered_seq: Option<u32>,
     /// Commands of earlier sessions that the line did not take.
     not_taken_before: u64,
@@ -144,8 +144,8 @@ impl<P: Port> BoardHost<P> {
         Ok(host)
     }
 
-    /// Numbers the commands of each session from `seq` on (0 unless said), to see what happens at the end of the numbers: they
-    /// wrap after seven weeks at 1 kHz.
+    /// Numbers the commands of each session from `seq` on (default 0), to test the wrap of the numbers, which comes after seven
+    /// weeks at 1 kHz.
     pub fn count_from(&mut self, seq: u32) {
         self.first_seq = seq;
     }
@@ -211,7 +211,7 @@ impl<P: Port> BoardHost<P> {
     /// # Errors
     /// The line is broken, or no status came.
     pub fn status(&mut self) -> Result<Status, ActuatorError> {
-        // No refusal answers a status request, so the request only names what is waited for.
+        // No refusal answers a status request, so the request only serves as the name in errors.
         self.ask(
             &ToBoard::StatusRequest,
             Request::Hello,
@@ -254,8 +254,8 @@ impl<P: Port> BoardHost<P> {
             .map_err(|error| self.line_error("writing", error))
     }
 
-    /// Sends what must reach the board: waits for a line that takes nothing, and leaves the message to
-    /// [`Actuator::poll`] when that takes longer than an answer may.
+    /// Sends a message that must reach the board. If the line accepts nothing, it waits; after the time of an answer it leaves
+    /// the message to [`Actuator::poll`].
     fn order(&mut self, message: &ToBoard) -> Result<(), ActuatorError> {
         let give_up_ns = self.clock.now_ns() + ANSWER_WITHIN.as_nanos() as i64;
         let mut sent = self.send(message)?;
@@ -301,7 +301,7 @@ impl<P: Port> BoardHost<P> {
         report
     }
 
-    /// Reads what has arrived and hands each message to `each` until it gives something.
+    /// Reads the messages that have arrived, and passes each to `each` until that returns a result.
     fn receive<T>(
         &mut self,
         mut each: impl FnMut(ToHost) -> Option<T>,

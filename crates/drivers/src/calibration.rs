@@ -52,7 +52,7 @@ impl Calibration {
         }
     }
 
-    /// The first value that cannot be: key, value, and what would be right.
+    /// The first invalid value: key, value, and what would be right.
     pub fn problem(&self) -> Option<(&'static str, f64, &'static str)> {
         let pixel_ok = (1e-4..=1e3).contains(&self.pixel_um);
         let sign_ok = self.sign.abs() == 1.0;
@@ -148,7 +148,7 @@ impl Calibration {
         self.pixel_um * self.pixel_um * cell.var_area_px2.sqrt()
     }
 
-    /// A speed along the channel (um/s) as it shows in the picture, px/s.
+    /// A speed along the channel (um/s), in the picture, px/s.
     pub fn flow_px_per_s(&self, um_per_s: f64) -> (f64, f64) {
         let (ux, uy) = self.direction();
         let px_per_s = um_per_s / self.pixel_um;

@@ -4,7 +4,7 @@ use crate::calibration::{Axis, Calibration};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// What a calibration file holds.
+/// Contents of a calibration file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CalibrationFile {
@@ -26,11 +26,11 @@ pub struct CalibrationFile {
     pub origin_across_px: f64,
     /// Day of the calibration, YYYY-MM-DD.
     pub date: String,
-    /// How it was done: stage micrometer, known step, maker's data.
+    /// Its method: stage micrometer, known step, maker's data.
     pub method: String,
 }
 
-/// Why a calibration cannot be used.
+/// The reason why a calibration cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibrationError {
     /// The file cannot be read.
@@ -44,7 +44,7 @@ pub enum CalibrationError {
         /// What the operating system said.
         cause: std::io::Error,
     },
-    /// The file is no calibration.
+    /// The file is not a calibration.
     #[error("calibration {}: {cause}", path.display())]
     Syntax {
         /// Which file.
@@ -52,7 +52,7 @@ pub enum CalibrationError {
         /// What is wrong, with the line.
         cause: toml::de::Error,
     },
-    /// A value that cannot be.
+    /// An invalid value.
     #[error("calibration {}: {key} = {value}: must be {must_be}", path.display())]
     Value {
         /// Which file.
@@ -70,7 +70,7 @@ impl CalibrationFile {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// The file is missing, no calibration, or holds a value that cannot be.
+    /// The file is missing, is not a calibration, or holds an invalid value.
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         let text = std::fs::read_to_string(path).map_err(|cause| CalibrationError::Unreadable {
             path: path.to_path_buf(),
@@ -82,7 +82,7 @@ impl CalibrationFile {
     /// Reads the text of a file; `path` is for the errors.
     ///
     /// # Errors
-    /// The text is no calibration, or holds a value that cannot be.
+    /// The text is not a calibration, or holds an invalid value.
     pub fn parse(text: &str, path: &Path) -> Result<Self, CalibrationError> {
         let file: Self = toml::from_str(text).map_err(|cause| CalibrationError::Syntax {
             path: path.to_path_buf(),
@@ -125,7 +125,7 @@ impl CalibrationFile {
         )
     }
 
-    /// The calibration as the loop takes it.
+    /// The calibration in the form for the loop.
     pub fn calibration(&self) -> Calibration {
         Calibration {
             pixel_um: self.pixel_um,

@@ -1,4 +1,4 @@
-//! The flow that was commanded, as vision uses it to predict where the bead will be.
+//! The commanded flow, from which vision predicts the bead's position.
 //!
 //! The PZT sets the bead's velocity: `v = K (x1 - neutral)`. This records the commands to the board with their times. One camera
 //! delay later the tracker asks for the flow commanded between two exposures. Written by the actuator thread
@@ -40,12 +40,12 @@ impl CommandedFlow {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes another gain, as of now and for what was commanded before, too.
+    /// Sets another gain, also for earlier commands.
     pub fn set_gain_per_s(&self, gain_per_s: f64) {
         self.history().gain_per_s = gain_per_s;
     }
 
-    /// Notes that from `time_ns` on the PZT stands `offset_um` from neutral. What is no number counts as no flow.
+    /// Notes that from `time_ns` on the PZT is `offset_um` from neutral. NaN counts as no flow.
     pub fn note(&self, time_ns: i64, offset_um: f64) {
         let mut history = self.history();
         let at = history.count % REMEMBERED;
@@ -85,7 +85,7 @@ impl CommandedFlow {
     }
 }
 
-/// An actuator whose commands are noted in a [`CommandedFlow`].
+/// An actuator that notes its commands in a [`CommandedFlow`].
 #[derive(Debug)]
 pub struct FlowTap<A> {
     inner: A,
@@ -126,7 +126,7 @@ impl<A> FlowTap<A> {
             let share = -(-((now_ns - at_ns) as f64 * 1e-9) / REFERENCE_S).exp_m1();
             um + share * (neutral_um - um)
         });
-        // A zero flow that is no number is no reason to forget the last one.
+        // If the zero flow is NaN, keep the last one.
         if moved_um.is_finite() {
             self.reference = Some((moved_um, now_ns));
         }

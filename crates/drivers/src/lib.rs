@@ -1,11 +1,11 @@
 //! Drivers: the traits of `cellpos-rig` for real devices.
 //!
-//! Three kinds of [`Camera`](cellpos_rig::Camera) are here: a camera server's socket ([`socket`]), GigE and USB3 Vision
-//! cameras (`sources::industrial`, feature `aravis`), and recordings on disk ([`sources`]). [`VisionSource`] joins a camera
-//! with a tracker and a calibration to a stream of positions. The [`Actuator`](cellpos_rig::Actuator) is the PZT board at
-//! the end of any byte [`Port`].
+//! There are three kinds of [`Camera`](cellpos_rig::Camera): a camera server's socket ([`socket`]), GigE and USB3 Vision cameras
+//! (`sources::industrial`, feature `aravis`), and recordings on disk ([`sources`]). [`VisionSource`] joins a camera with a
+//! tracker and a calibration to a stream of positions. The [`Actuator`](cellpos_rig::Actuator) is the PZT board at the end of any
+//! byte [`Port`].
 //!
-//! Drivers know no simulator. They may block, allocate and take locks: they run on I/O threads, never in a tick.
+//! Drivers do not know the emulator. They may block, allocate and take locks, because they run on I/O threads, never in a tick.
 //!
 //! ```
 //! use cellpos_drivers::Calibration;

@@ -1,9 +1,9 @@
-//! Frames on their way to the board over a line that may take nothing, or a part of a frame, at a time.
+//! Frames on their way to the board, over a line that may accept nothing or only a part of a frame.
 
 use crate::port::Port;
 use cellpos_link::MAX_FRAME;
 
-/// What a frame holds: commands give way to newer ones, orders do not.
+/// Kind of a frame: a newer command replaces a command, but nothing replaces an order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// A set point: only the newest is of use.
@@ -65,7 +65,7 @@ impl Outbox {
         }
     }
 
-    /// Writes as much as the line takes now; whether nothing is left.
+    /// Writes as much as the line accepts now; returns whether nothing is left.
     ///
     /// # Errors
     /// The line is gone. A truncated frame is lost if it is a command, and written again from its beginning if it is an order.

@@ -5,7 +5,7 @@ use cellpos_rig::{
     PartnerReport,
 };
 
-/// How the partner is armed; the session's number is that of the fast one.
+/// Settings for arming the partner; the session has the number of the fast actuator's.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartnerRequest {
     /// End of a ramp to park, on its own scale, um.
@@ -57,7 +57,7 @@ impl Actuator for Pair {
             watchdog_ms,
             hold_watchdog_ms,
         };
-        // First the slow one: the fast one's watchdog for the first command begins with its own arming.
+        // Arm the slow one first: the fast one's watchdog for the first command starts when it is armed.
         self.slow_is_armed = self.slow.arm(&of_slow).is_ok();
         self.fast.arm(request)
     }
@@ -77,7 +77,7 @@ impl Actuator for Pair {
     }
 
     fn park(&mut self) -> Result<(), ActuatorError> {
-        // Whatever fails here, its own watchdog does the same.
+        // If this fails, its own watchdog does the same.
         let _ = self.slow.park();
         self.fast.park()
     }

@@ -4,12 +4,12 @@
 pub trait Port: Send {
     /// Name, for messages.
     fn name(&self) -> &str;
-    /// Writes as many of the bytes as the line takes now, and says how many: 0 when it takes none.
+    /// Writes as many bytes as the line accepts now, and returns their number, which may be 0.
     ///
     /// # Errors
     /// The line is gone; a later call may find it again.
     fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize>;
-    /// Reads what is there, at most `buffer.len()` bytes; 0 when nothing is.
+    /// Reads the bytes that have arrived, at most `buffer.len()`; 0 if there are none.
     ///
     /// # Errors
     /// The line is gone; a later call may find it again.

@@ -6,10 +6,10 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// How often a program that has gone is looked for.
+/// Interval between two attempts to find a program that has gone.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// A connection to a program that serves an actuator. One that has gone is connected to again once it is back.
+/// A connection to a program that serves an actuator. If the program goes and comes back, it connects again.
 #[derive(Debug)]
 pub struct ProgramLine {
     path: PathBuf,
@@ -25,7 +25,7 @@ fn connected(path: &Path) -> std::io::Result<UnixStream> {
 }
 
 impl ProgramLine {
-    /// Connects to a program that serves.
+    /// Connects to the program at a socket.
     ///
     /// # Errors
     /// Nobody serves the socket.
@@ -38,7 +38,7 @@ impl ProgramLine {
         })
     }
 
-    /// The stream; where the program has gone, a new one if it is back.
+    /// The stream; if the program was gone and is back, a new one.
     fn stream(&mut self) -> std::io::Result<&mut UnixStream> {
         if self.stream.is_none() && self.looked.elapsed() >= LOOK_EVERY {
             self.looked = Instant::now();

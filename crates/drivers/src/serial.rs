@@ -13,13 +13,13 @@ use std::os::fd::OwnedFd;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Longest wait for a line that takes nothing, ns: half a period of the loop. So answers that arrive meanwhile are still read in
-/// the period of their command.
+/// Longest wait for a line that accepts nothing, ns: half a period of the loop. So answers that arrive meanwhile are still read
+/// in the period of their command.
 const WAIT_NS: i64 = 500_000;
-/// How often a line that is gone is looked for: opening a USB port takes milliseconds.
+/// Interval between two attempts to open a lost line: opening a USB port takes milliseconds.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// An open serial port. One that was unplugged is opened again once it is back.
+/// An open serial port. If it is unplugged and comes back, it opens again.
 #[derive(Debug)]
 pub struct SerialLine {
     port: Option<OwnedFd>,
@@ -32,7 +32,7 @@ impl SerialLine {
     /// Opens a port for this process alone. A pseudo-terminal takes any baud rate.
     ///
     /// # Errors
-    /// The port does not exist, is in use, or is no serial port.
+    /// The port does not exist, is in use, or is not a serial port.
     pub fn open(path: &str, baud: u32) -> std::io::Result<Self> {
         Ok(Self {
             port: Some(open(path, baud)?),
@@ -95,8 +95,8 @@ impl Port for SerialLine {
 
     fn write_some(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let port = self.port()?;
-        // Written first and waited for afterwards: a USB line says that it is not writable while a transfer is in flight, and
-        // takes the next one all the same.
+        // Write first and wait afterwards: during a transfer a USB line reports that it is not writable, but accepts the next
+        // one.
         let taken = match rustix::io::write(port, bytes) {
             Err(Errno::AGAIN) => {
                 let span = Timespec {
@@ -117,7 +117,7 @@ impl Port for SerialLine {
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
         match rustix::io::read(self.port()?, buffer) {
-            // A terminal that has nothing says AGAIN; the end of the file is the end of the line.
+            // A terminal without data returns AGAIN; an end of file means that the line is gone.
             Ok(0) => Err(self.gone(ErrorKind::UnexpectedEof)),
             Ok(length) => Ok(length),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),

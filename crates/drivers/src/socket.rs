@@ -1,7 +1,7 @@
 //! A camera at the other end of a Unix socket: framing as in [`cellpos_link::frames`].
 //!
-//! If the server disappears, the camera tries to connect again. So a restarted camera process costs frames and not the run. The
-//! loop sees silence meanwhile and acts on it.
+//! If the server disappears, the camera tries to connect again. So a restart of the camera process costs frames, but not the run.
+//! The loop meanwhile sees silence and reacts to it.
 
 use cellpos_link::frames::FrameGatherer;
 use cellpos_rig::clock::{Clock, monotonic_ns};
@@ -11,7 +11,7 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// How often a lost server is looked for.
+/// Interval between two attempts to find a lost server.
 const RECONNECT_EVERY: Duration = Duration::from_millis(20);
 /// One read: several small frames, or a piece of a large one.
 const CHUNK: usize = 1 << 16;
@@ -32,7 +32,7 @@ impl SocketCamera {
     /// Connects, and waits for the first frame to learn its size.
     ///
     /// # Errors
-    /// Nobody serves the socket, or what comes is no camera stream.
+    /// Nobody serves the socket, or the data are not a camera stream.
     pub fn connect(
         path: &Path,
         rate_hz: f64,
@@ -123,7 +123,7 @@ impl SocketCamera {
     }
 }
 
-/// Reads what is there, without waiting.
+/// Reads the bytes that have arrived, without waiting.
 fn at_hand(stream: &mut UnixStream, chunk: &mut [u8]) -> std::io::Result<usize> {
     stream.set_nonblocking(true)?;
     let read = stream.read(chunk);

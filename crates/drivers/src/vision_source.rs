@@ -1,8 +1,8 @@
-//! A camera with a tracker: frames in, positions of one and the same bead, or cell, out.
+//! A camera with a tracker: turns frames into positions of one bead or cell.
 //!
-//! The tracker predicts the bead from the commanded flow, takes a fix only when place, intensity, size and residual
-//! agree, and reports its state and reason for every frame. A fix that it does not take gives no position, so that the
-//! loop coasts rather than follows another bead. Of a cell, length and area come with the position.
+//! The tracker predicts the bead from the commanded flow. It accepts a fix only if place, intensity, size and residual agree, and
+//! reports its state and reason for every frame. A refused fix gives no position, so that the loop coasts instead of following
+//! another bead. A cell's position comes with length and area.
 
 use crate::calibration::{Axis, Calibration};
 use crate::flow::CommandedFlow;
@@ -52,7 +52,7 @@ impl Followed {
         }
     }
 
-    /// Half the width of what is drawn around it, px.
+    /// Half the width of the mark around it, px.
     fn half_px(&self, cell: Option<&Cell>) -> (f64, f64) {
         match self {
             Self::Bead(tracker) => {
@@ -66,7 +66,7 @@ impl Followed {
         }
     }
 
-    /// Outline of the cell that was taken, px; empty for a bead.
+    /// Outline of the accepted cell, px; empty for a bead.
     fn outline(&self, cell: Option<&Cell>) -> &[(f64, f64)] {
         match (self, cell) {
             (Self::Cell(tracker), Some(cell)) => tracker.outline(cell),
@@ -137,7 +137,7 @@ impl<C: Camera> VisionSource<C> {
             1_000_000
         };
         Self {
-            // A frame that has grown old on its way still tells the tracker where the bead went.
+            // A frame that arrived too old still informs the tracker of the bead's motion.
             account: FrameAccount::new(IdKind::Wide, period_ns, i64::MAX),
             camera,
             followed: tracker.into(),
@@ -153,20 +153,20 @@ impl<C: Camera> VisionSource<C> {
         }
     }
 
-    /// Lets the tracker predict from what is commanded.
+    /// Lets the tracker predict from the commands.
     pub fn with_flow(mut self, flow: CommandedFlow) -> Self {
         self.flow = Some(flow);
         self
     }
 
-    /// The camera's pictures have no noise: two may be equal. Those of a real camera never are, for shot noise does not
-    /// repeat; equal ones come from a grabber or a driver that hangs, and count as stale.
+    /// Declares that the camera's pictures have no noise, so two may be equal. Pictures of a real camera never are, because shot
+    /// noise does not repeat: equal ones come from a hanging grabber or driver and count as stale.
     pub fn noise_free(mut self) -> Self {
         self.noise_free = true;
         self
     }
 
-    /// Of several beads or cells, the one nearest to this position at the start is followed; without it the most prominent.
+    /// If there are several beads or cells at the start, tracks the one nearest to this position; without it, the most prominent.
     pub fn near(mut self, position_um: f64) -> Self {
         let info = self.camera.info();
         let across_px = match self.calibration.axis {
@@ -178,7 +178,7 @@ impl<C: Camera> VisionSource<C> {
         self
     }
 
-    /// Looks at the frame in the buffer; `None` for one that is not new ([`FrameAccount`]), or is the picture before once more.
+    /// Processes the frame in the buffer; `None` if it is not new ([`FrameAccount`]) or repeats the picture before.
     fn look(
         &mut self,
         stamp: &FrameStamp,

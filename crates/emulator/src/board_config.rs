@@ -20,17 +20,18 @@ pub struct BoardConfig {
     pub ramp_um_per_s: f64,
     /// Displacement after power-up, until the first session ends, um.
     pub power_up_um: f64,
-    /// Where a ramp to park ends unless the host says otherwise, um.
+    /// Displacement at the end of a ramp to park, unless the host sets another, um.
     pub park_um: f64,
     /// Bits of the converter, 8..=16.
     pub dac_bits: u8,
     /// Period of the output's updates while it moves, us.
     pub update_us: u32,
-    /// Default time without a fresh command after which the output goes to the zero-flow displacement, ms.
+    /// Default time without a new command after which the output moves to the zero-flow displacement, ms.
     pub watchdog_ms: u16,
-    /// Default time that it is then held, and that a freeze or an armed board waits, before the ramp to park, ms.
+    /// Default holding time before the ramp to park, ms: after that move, in a freeze, and for an armed board without a
+    /// command.
     pub hold_watchdog_ms: u16,
-    /// Longest watchdog time that a host may ask for, ms.
+    /// Longest watchdog time that a host may request, ms.
     pub longest_watchdog_ms: u16,
     /// A command that took this much longer than the fastest one counts as late, us.
     pub late_us: u32,
@@ -58,7 +59,7 @@ impl Default for BoardConfig {
     }
 }
 
-/// A value of [`BoardConfig`] that cannot be.
+/// An invalid value of [`BoardConfig`].
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("board: `{key}` is {value}, must be {must}")]
 pub struct BoardConfigError {

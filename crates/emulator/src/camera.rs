@@ -8,14 +8,14 @@ use cellpos_plant::effects::Action;
 use cellpos_vision::FixQuality;
 use std::collections::VecDeque;
 
-/// The path during an exposure is sampled at both ends and in between, this many intervals.
+/// Number of intervals in which the path during an exposure is sampled.
 pub(crate) const EXPOSURE_STEPS: usize = 4;
-/// Frames that wait for delivery at most; beyond that the oldest are lost, as in any camera's buffer.
+/// Most frames that wait for delivery; beyond that the oldest are lost, as in any camera's buffer.
 const QUEUE_LEN: usize = 256;
-/// A stale frame shows what was seen this many frames before.
+/// A stale frame shows the picture of this many frames before.
 const STALE_BY: usize = 5;
 
-/// What is known of a delivered frame besides its pixels. Times are those given to the world.
+/// Data of a delivered frame besides its pixels. Times are those given to the world.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameInfo {
     /// Rises by one per exposed frame, from 0.
@@ -53,7 +53,7 @@ pub struct PositionFix {
     pub variance_um2: f64,
     /// Peak contrast over the noise of one background pixel.
     pub snr: f64,
-    /// What vision would say of the picture.
+    /// The verdict that vision would give on the picture.
     pub verdict: FixQuality,
 }
 
@@ -67,7 +67,7 @@ pub(crate) struct Sample {
     pub seen_um: f64,
     /// Position of a second bead, if there is one.
     pub second_um: Option<(f64, f64)>,
-    /// Size of the bead's ring against that in focus, less one.
+    /// Relative difference of the bead's ring from its size in focus.
     pub defocus: f64,
     pub visible: bool,
     pub lit: bool,
@@ -90,7 +90,7 @@ impl Exposure {
         Some(middle.length_um).filter(|um| um.is_finite())
     }
 
-    /// Size of the bead's ring in the middle of the exposure against that in focus, less one.
+    /// Relative difference of the bead's ring from its size in focus, in the middle of the exposure.
     pub(crate) fn defocus(&self) -> f64 {
         self.samples
             .get(EXPOSURE_STEPS / 2)
@@ -133,16 +133,16 @@ pub(crate) struct Camera {
     strays: Strays,
 }
 
-/// How exposures and arrivals stray from their times.
+/// Jitter of exposures and arrivals.
 #[derive(Debug, Clone)]
 struct Strays {
     exposure_ns: f64,
     arrival_ns: f64,
     exposures: Random,
     arrivals: Random,
-    /// By how much the next exposure is late.
+    /// Delay of the next exposure.
     now_ns: i64,
-    /// No frame overtakes another on its way.
+    /// Earliest arrival of the next frame: no frame overtakes another.
     last_ns: i64,
 }
 
@@ -167,7 +167,7 @@ impl Strays {
         self.now_ns = (stray * self.exposure_ns).round() as i64;
     }
 
-    /// When a frame arrives that could arrive at `fastest_ns`.
+    /// Arrival of a frame that could arrive at `fastest_ns`.
     fn arrival_ns(&mut self, fastest_ns: i64) -> i64 {
         let beyond = -(1.0 - self.arrivals.uniform()).ln();
         let arrival_ns = fastest_ns + (beyond * self.arrival_ns) as i64;
@@ -197,7 +197,7 @@ impl Camera {
         camera
     }
 
-    /// Effects at the camera's place say what this camera is like; they take the place of the world's own figures.
+    /// Effects at the camera's place describe this camera and replace the world's own figures.
     fn take_over(&mut self, model: &Model) {
         let mut delay_ns = None;
         for effect in &model.effects {
@@ -223,7 +223,7 @@ impl Camera {
         self.start_ns + ((id + 1) as f64 * self.period_ns).round() as i64
     }
 
-    /// When the bead has to be looked at next.
+    /// Time of the next sample of the bead.
     pub(crate) fn next_sample_ns(&self) -> i64 {
         self.mid_ns(self.next_id) + self.strays.now_ns - self.exposure_ns / 2
             + self.exposure_ns * self.taken as i64 / EXPOSURE_STEPS as i64
@@ -258,7 +258,7 @@ impl Camera {
             ),
             samples: self.samples,
         };
-        // All four are drawn for every frame, so that one rate does not shift the others' luck.
+        // Draw all four for every frame, so that one rate does not change the random outcome of the others.
         let luck: [f64; 4] = core::array::from_fn(|_| self.rng.uniform());
         let elapsed_ns = now.mid_ns - self.start_ns;
         let hit = |kind, luck: f64, rate: f64| luck < rate || self.faults.active(kind, elapsed_ns);
@@ -317,7 +317,7 @@ impl Camera {
         }
     }
 
-    /// When the next frame is delivered, of those exposed so far.
+    /// Delivery time of the next frame that is already exposed.
     pub(crate) fn next_delivery_ns(&self) -> Option<i64> {
         self.queue.front().map(|pending| pending.delivery_ns)
     }

@@ -1,9 +1,9 @@
-//! A cell instead of a bead: it is driven into a constriction, stretches there and tires.
+//! A cell instead of a bead: the flow drives it into a constriction, where it stretches and tires.
 //!
-//! The shape is a Kelvin-Voigt body: its length follows the load with a first-order lag, short while it is pressed into
-//! the constriction, longer while it recovers outside. With every passage it stretches less and recovers more slowly,
-//! linearly up to the last passage of [`CellConfig::fatigue_passages`]. In the constriction the same PZT displacement
-//! moves it faster. Not here: friction at the wall and adhesion.
+//! The shape is a Kelvin-Voigt body: its length follows the load with a first-order lag. The lag is short on the way into the
+//! constriction and longer during the recovery outside. With every passage it stretches less and recovers more slowly, linearly
+//! up to the last passage of [`CellConfig::fatigue_passages`]. In the constriction the same PZT displacement moves it faster. Not
+//! here: friction at the wall and adhesion.
 
 use crate::error::{WorldError, within};
 use cellpos_numeric::Random;
@@ -18,7 +18,7 @@ pub struct CellConfig {
     pub entry_um: f64,
     /// Length of the mouth, over which gain and load change, um.
     pub mouth_um: f64,
-    /// Speed of the cell inside over that outside, at the same displacement of the PZT.
+    /// Ratio of the cell's speeds inside and outside, at the same displacement of the PZT.
     pub gain: f64,
     /// Length of the cell without load, um.
     pub rest_um: f64,
@@ -32,14 +32,14 @@ pub struct CellConfig {
     pub recovery_first_s: f64,
     /// The same, after the last.
     pub recovery_last_s: f64,
-    /// Passages over which it tires; more change nothing.
+    /// Passages over which it tires; later ones change nothing.
     pub fatigue_passages: u32,
     /// Contrast of the body, as a share of `contrast_grey`; negative: darker than the background.
     pub body: f64,
     /// Contrast of rim and halo at 1 um out of focus, as a share of `contrast_grey`.
     pub halo: f64,
-    /// Distance of the cell's middle from the focus, um: positive with a rim of the sign of the contrast and a halo of the
-    /// other, negative the other way round.
+    /// Distance of the cell's middle from the focus, um. If positive, the rim has the sign of the contrast and the halo the
+    /// opposite one; if negative, the other way round.
     pub focus_um: f64,
     /// Noise of the length delivered without pictures, um RMS; the area is that of the measured length.
     pub noise_um: f64,
@@ -115,7 +115,7 @@ impl CellConfig {
         FRAC_PI_4 * length_um * self.width_um(length_um)
     }
 
-    /// How far a position is inside: 0 outside, 1 inside, smooth in between.
+    /// Degree to which a position is inside: 0 outside, 1 inside, smooth in between.
     pub(crate) fn inside(&self, x_um: f64) -> f64 {
         let share = ((x_um - self.entry_um) / self.mouth_um + 0.5).clamp(0.0, 1.0);
         share * share * (3.0 - 2.0 * share)
@@ -127,7 +127,7 @@ impl CellConfig {
     }
 }
 
-/// The cell as it is now.
+/// The present state of the cell.
 #[derive(Debug, Clone)]
 pub(crate) struct Cell {
     config: CellConfig,
@@ -148,7 +148,7 @@ impl Cell {
         }
     }
 
-    /// By how much more than a bead the cell moves with the fluid, when a bead moves by `bead_um` from `x_um`.
+    /// Additional motion of the cell with the fluid, compared with a bead that moves by `bead_um` from `x_um`.
     pub(crate) fn surplus_um(&self, x_um: f64, bead_um: f64) -> f64 {
         bead_um * (self.config.gain - 1.0) * self.config.inside(x_um)
     }
@@ -159,7 +159,7 @@ impl Cell {
         let inside = c.inside(x_um);
         let stretch = c.between(c.stretch_first, c.stretch_last, self.passages);
         let load_um = c.rest_um * (1.0 + (stretch - 1.0) * inside);
-        // The recovery that follows a passage is that passage's, although it is counted when the cell has left.
+        // The recovery after a passage belongs to that passage, although it counts only when the cell has left.
         let tired = self.passages.saturating_sub(u32::from(!self.was_inside));
         let recovery_s = c.between(c.recovery_first_s, c.recovery_last_s, tired);
         let lag_s = if load_um > self.length_um {
@@ -191,8 +191,7 @@ impl Cell {
 
     /// Length (um) and projected area (um^2) as measured of a cell of a true length.
     ///
-    /// The area is that of the measured length, so that both have the same noise. Both are NaN where the noise would
-    /// leave no length at all.
+    /// The area comes from the measured length, so both have the same noise. Both are NaN if the noise makes the length negative.
     pub(crate) fn measured(&mut self, length_um: f64) -> (f64, f64) {
         let noisy_um = length_um + self.config.noise_um * self.noise.normal();
         if noisy_um > 0.0 {

@@ -1,13 +1,13 @@
-//! What a cell and its channel look like: an ellipse with a soft edge, a rim and a halo, between two walls.
+//! The picture of a cell and its channel: an ellipse with a soft edge, a rim and a halo, between two walls.
 //!
-//! Body: a step blurred by the microscope, the more the further the cell is out of focus. Out of focus the edge's phase shows as
-//! well, as the second derivative of that step (transport of intensity): a rim just inside the edge and a halo of the other sign
-//! just outside. They change places on the other side of the focus.
+//! The body is a step blurred by the microscope; defocus adds blur. Out of focus the edge's phase also shows, as the second derivative of
+//! that step (transport of intensity). It gives a rim just inside the edge and a halo of the other sign just outside. They swap on the
+//! other side of the focus.
 
 use crate::cell::CellConfig;
 use crate::config::WorldConfig;
 
-/// Standard deviation of the soft edge that the microscope gives to everything in focus, um.
+/// Standard deviation of the microscope's soft edge in focus, um.
 const BLUR_UM: f64 = 0.2;
 /// Standard deviation of the blur that defocus adds, per um (numerical aperture of about 0.5).
 const BLUR_PER_FOCUS: f64 = 0.15;
@@ -17,7 +17,7 @@ const HALO_FOCUS_UM: f64 = 1.0;
 const MOST_PHASE: f64 = 2.0;
 /// Additional contrast of the rim, as a fraction of the body's, and its distance from the edge in edge widths.
 const RIM: (f64, f64) = (0.3, 3.0);
-/// Edge widths beyond which nothing is drawn.
+/// Distance from the edge beyond which nothing is drawn, in edge widths.
 const REACH: f64 = 5.0;
 /// Steps of the edge's table per edge width.
 const STEPS: f64 = 32.0;
@@ -113,8 +113,8 @@ impl CellPicture {
     }
 }
 
-/// Grey levels that the channel's walls take from a pixel, by its number, if above zero: outside as far apart as the cell at rest is
-/// wide, in the constriction as the least stretched cell.
+/// Grey levels that the channel's walls take from a pixel, with the pixel's number, if above zero. Outside, the walls are as far apart as
+/// the cell at rest is wide; in the constriction, as the least stretched cell.
 pub(crate) fn walls(config: &WorldConfig, cell: &CellConfig) -> Vec<(usize, f32)> {
     let blur_um = BLUR_UM.max(config.pixel_um);
     let inside_um = cell.width_um(cell.rest_um * cell.stretch_first.min(cell.stretch_last));

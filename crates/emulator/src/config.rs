@@ -14,11 +14,11 @@ pub struct WorldConfig {
     pub seed: u64,
     /// Plant and effects: `eq6` or the path of a model.toml.
     pub model: String,
-    /// PZT displacement at which the bead is at rest, um. Takes the place of the model's working point.
+    /// PZT displacement at which the bead is at rest, um. Replaces the model's working point.
     pub neutral_um: f64,
-    /// Diffusion coefficient of the bead, um^2/s. Takes the place of the model's.
+    /// Diffusion coefficient of the bead, um^2/s. Replaces the model's.
     pub diffusion_um2_per_s: f64,
-    /// Flow that passes whatever the PZT does, um/s; added to a flow-drift of the model.
+    /// Flow independent of the PZT, um/s; added to a flow-drift of the model.
     pub drift_um_per_s: f64,
     /// Bead position at the start, um from the middle of the frame.
     pub start_um: f64,
@@ -36,7 +36,7 @@ pub struct WorldConfig {
     pub latency_ms: f64,
     /// Radius of the bead, um: where its profile first crosses the background; of no effect with a cell.
     pub bead_radius_um: f64,
-    /// What the bead looks like.
+    /// The look of the bead.
     pub bead_look: BeadLook,
     /// Contrast of the middle of bead or cell against the background, grey levels of 8 bits.
     pub contrast_grey: f64,
@@ -48,9 +48,9 @@ pub struct WorldConfig {
     pub electrons_per_grey: f64,
     /// Localisation noise of positions delivered without pictures, um RMS. Default: as from pictures.
     pub localisation_um: Option<f64>,
-    /// When the bead has been out of the frame for this long and the flow is slow, a new one comes, ms. Left out: never.
+    /// Time after which a new bead comes, once the old one has left the frame and the flow is slow, ms. Left out: never.
     pub new_bead_after_ms: Option<f64>,
-    /// Without any of the `Imperfections` of a real rig, but for those whose key is given.
+    /// Switches off all `Imperfections` of a real rig, except those whose key is given.
     pub ideal: bool,
     /// `Imperfections::zero_flow_wander_um`.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -351,7 +351,7 @@ impl WorldConfig {
         0.5 * f64::from(self.width_px) * self.pixel_um
     }
 
-    /// Half of the length along the channel of what is in view, um.
+    /// Half of the visible length along the channel, um.
     pub(crate) fn half_length_um(&self, length_um: Option<f64>) -> f64 {
         length_um.map_or(self.bead_radius_um, |um| 0.5 * um)
     }

@@ -1,7 +1,7 @@
-//! The rig without a rig: the firmware library, the plant and the rendered camera in this process.
+//! An emulated rig in this process: the firmware library, the plant and the rendered camera.
 //!
-//! Camera and actuator share one [`RigInABox`] behind a lock; only I/O threads touch it. On the real clock the world follows the
-//! clock at each access; on the virtual clock as well, with time standing still in between.
+//! Camera and actuator share one [`RigInABox`] behind a lock; only I/O threads touch it. The world follows its clock, real or
+//! virtual, at each access; virtual time does not advance in between.
 
 use crate::board_config::BoardConfig;
 use crate::config::WorldConfig;
@@ -24,10 +24,10 @@ pub struct EmulatedRig {
 }
 
 impl EmulatedRig {
-    /// A rig that has just been switched on.
+    /// A rig that was just switched on.
     ///
     /// # Errors
-    /// [`BoxError`] names the value that cannot be.
+    /// [`BoxError`] names the invalid value.
     pub fn new(
         board: BoardConfig,
         world: &WorldConfig,
@@ -44,7 +44,7 @@ impl EmulatedRig {
     /// The same with a slow partner of the PZT.
     ///
     /// # Errors
-    /// Its board cannot be.
+    /// The board of the partner is invalid.
     pub fn with_partner(
         board: BoardConfig,
         world: &WorldConfig,
@@ -61,7 +61,7 @@ impl EmulatedRig {
 
     /// The box, brought up to the present.
     pub fn now(&self) -> MutexGuard<'_, RigInABox> {
-        // A thread that panicked while it held the lock left a world that is still a world.
+        // The world is valid even if a thread panicked while it held the lock.
         let mut rig = self.rig.lock().unwrap_or_else(PoisonError::into_inner);
         let now_ns = self.clock.now_ns();
         rig.advance_to(now_ns);
@@ -131,7 +131,7 @@ impl EmulatedRig {
         deadline_ns: i64,
         take: impl Fn(&mut RigInABox) -> Option<T>,
     ) -> Option<(T, i64, f64, f64)> {
-        /// How long to sleep when no exposure is on its way yet.
+        /// Time to sleep if no exposure has begun yet.
         const LOOK_EVERY_NS: i64 = 200_000;
         loop {
             let wake_ns = {

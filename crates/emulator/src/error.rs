@@ -1,9 +1,9 @@
-//! What can be wrong with the world that is asked for.
+//! Errors in the description of a world.
 
-/// Why there is no such world.
+/// The reason why such a world cannot be built.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum WorldError {
-    /// A value that cannot be.
+    /// An invalid value.
     #[error("[emulator] `{key}` is {value}, must be {must}")]
     Value {
         /// Key.
@@ -18,7 +18,7 @@ pub enum WorldError {
     Model(String),
 }
 
-/// Checks that a value lies between two others, both included; `must` says that in words, with the unit.
+/// Checks that a value is between two others, both included; `must` states that in words, with the unit.
 pub(crate) fn within(
     key: &'static str,
     value: f64,

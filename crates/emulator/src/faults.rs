@@ -1,24 +1,24 @@
-//! What goes wrong, at random or at a given time.
+//! Faults of the rig, at random or at a given time.
 
 use crate::error::WorldError;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-/// Kinds of faults that are scheduled.
+/// Kinds of scheduled faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FaultKind {
-    /// The bead is not to be seen.
+    /// The bead is invisible.
     LoseBead,
-    /// A second bead swims along.
+    /// A second bead moves with the first.
     SecondBead,
     /// The bead sticks to the wall; the flow continues.
     StickBead,
-    /// The camera delivers nothing; what was exposed meanwhile comes in one burst afterwards.
+    /// The camera delivers nothing; the frames exposed meanwhile come in one burst afterwards.
     StallCamera,
     /// Frames are exposed and never delivered; their ids are missing.
     DropFrames,
-    /// The camera delivers old buffers: picture and time stamp of five frames before under the id of now.
+    /// The camera delivers old buffers: picture and time stamp of five frames before, with the present id.
     StaleFrames,
     /// Every frame is delivered twice, half a period apart.
     DoubleFrames,
@@ -26,7 +26,7 @@ pub enum FaultKind {
     ReorderFrames,
     /// The same picture under new ids and new time stamps: a frame grabber that hangs.
     FrozenPicture,
-    /// The zero flow stands [`Faults::flow_step_um`] off while it lasts: a tap on the syringe.
+    /// The zero flow is off by [`Faults::flow_step_um`] while it lasts: a tap on the syringe.
     FlowStep,
     /// The PZT moves the bead the wrong way: its sign is flipped about the zero flow.
     GainFlip,
@@ -38,9 +38,9 @@ pub enum FaultKind {
     LinkLoss,
     /// No byte passes the line to the slow partner or from it.
     PartnerLoss,
-    /// The optimiser gives no plan in time. The world is not affected; the program applies it to its loop.
+    /// The optimiser gives no plan in time. It does not affect the world; the program applies it to its loop.
     SlowSolver,
-    /// The recorder takes nothing, as if its disk hung. Also applied by the program, for the virtual clock, on which no disk hangs.
+    /// The recorder accepts nothing, as if its disk hung. The program applies it too, because on the virtual clock no disk hangs.
     StallRecorder,
 }
 
@@ -57,7 +57,7 @@ pub struct FaultEvent {
     pub for_s: Option<f64>,
 }
 
-/// All that goes wrong: rates per frame (or second), and scheduled events. The default is nothing.
+/// All faults: rates per frame (or second), and scheduled events. The default is no fault.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Faults {
@@ -71,9 +71,9 @@ pub struct Faults {
     pub reorder_rate: f64,
     /// Bursts of random bytes on the line per second.
     pub garbage_per_s: f64,
-    /// Where a second bead appears, um from the first.
+    /// Distance of a second bead from the first, um.
     pub second_bead_um: f64,
-    /// How far the zero flow steps, um.
+    /// Step of the zero flow, um.
     pub flow_step_um: f64,
     /// Largest displacement of an amplifier that clips, um.
     pub clip_um: f64,
@@ -112,7 +112,7 @@ impl Faults {
         })
     }
 
-    /// When the scheduled fault of this kind that is in force ends; `i64::MAX` for one that does not end.
+    /// End of the scheduled fault of this kind that is in force; `i64::MAX` if it does not end.
     pub fn end_ns(&self, kind: FaultKind, elapsed_ns: i64) -> Option<i64> {
         self.event
             .iter()
@@ -126,7 +126,7 @@ impl Faults {
             .max()
     }
 
-    /// When the scheduled faults of a kind are in force, ns from the start.
+    /// Times at which the scheduled faults of a kind are in force, ns from the start.
     pub fn spans_ns(&self, kind: FaultKind) -> Vec<Range<i64>> {
         let ns = |s: f64| (s * 1e9) as i64;
         let spans = self.event.iter().filter(|event| event.kind == kind);

@@ -1,7 +1,7 @@
 //! Imperfections of a real rig: flow, light and clocks.
 //!
-//! Every such key of `[emulator]` may be left out. Then it is as on a real rig with `ideal = false`, and
-//! nothing at all on an ideal rig. A given key holds on either rig.
+//! Every such key of `[emulator]` may be left out. With `ideal = false` it then has the value of a real rig; on an
+//! ideal rig it is zero. A given key holds on either rig.
 
 use crate::config::WorldConfig;
 use crate::error::{WorldError, within};
@@ -10,17 +10,17 @@ use cellpos_numeric::Random;
 /// The imperfections of a rig, all keys decided.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Imperfections {
-    /// How far the zero flow wanders about its mean (Ornstein-Uhlenbeck), um RMS.
+    /// Wander of the zero flow about its mean (Ornstein-Uhlenbeck), um RMS.
     pub zero_flow_wander_um: f64,
     /// Correlation time of that, s.
     pub zero_flow_wander_time_s: f64,
-    /// How fast the zero flow drifts, um of PZT displacement per second.
+    /// Drift of the zero flow, um of PZT displacement per second.
     pub zero_flow_drift_um_per_s: f64,
     /// The frame follows the bead across the channel to within this distance of its middle line, um.
     pub lateral_um: f64,
     /// Angle from the rows of the picture to the channel, degrees.
     pub tilt_deg: f64,
-    /// How much the bead's ring changes its size as the focus wanders, as a fraction, RMS.
+    /// Relative change of the bead's ring as the focus wanders, RMS.
     pub focus_wander: f64,
     /// Correlation time of the focus, s.
     pub focus_time_s: f64,
@@ -32,16 +32,16 @@ pub struct Imperfections {
     pub vignette: f64,
     /// Depth of the line by which a wall of the channel shows, grey levels.
     pub wall_grey: f64,
-    /// How much longer the camera's period is than it says, parts per million.
+    /// Excess of the camera's period over its stated period, parts per million.
     pub camera_clock_ppm: f64,
-    /// How far the exposures stray from the camera's clock, us RMS; its time stamps do not know.
+    /// Jitter of the exposures about the camera's clock, us RMS; not visible in its time stamps.
     pub exposure_jitter_us: f64,
     /// Mean additional delay of a frame over the fastest, us (exponential).
     pub arrival_jitter_us: f64,
 }
 
 impl Imperfections {
-    /// A rig on a good day: figures that a user of such a rig would not call a fault.
+    /// A rig on a good day: values that a user would not call a fault.
     pub const REAL: Self = Self {
         // A syringe pump at rest, and a reservoir that empties: 6 nm of PZT move a bead by 2.6 um/s.
         zero_flow_wander_um: 0.006,
@@ -49,7 +49,7 @@ impl Imperfections {
         zero_flow_drift_um_per_s: 0.001,
         lateral_um: 0.5,
         tilt_deg: 1.0,
-        // A stage that breathes by some tens of nanometres while the focus is kept.
+        // A stage that moves by some tens of nanometres while the focus is kept.
         focus_wander: 0.005,
         focus_time_s: 5.0,
         dust: 3,
@@ -79,7 +79,7 @@ impl Imperfections {
         arrival_jitter_us: 0.0,
     };
 
-    /// Whether the light of the empty channel is the same all over the picture.
+    /// Whether the light of the empty channel is even over the picture.
     pub fn has_even_light(&self) -> bool {
         [self.light_slope, self.vignette, self.wall_grey] == [0.0; 3] && self.dust == 0
     }
@@ -205,7 +205,7 @@ impl WorldConfig {
     }
 }
 
-/// An Ornstein-Uhlenbeck process, exact for any step, so that its path does not depend on who asks how often.
+/// An Ornstein-Uhlenbeck process, exact for any step, so its statistics do not depend on the calls' spacing.
 #[derive(Debug, Clone)]
 pub(crate) struct Wander {
     rms: f64,
@@ -215,7 +215,7 @@ pub(crate) struct Wander {
 }
 
 impl Wander {
-    /// Starts where it would be after a long time. A process of size 0 draws nothing more.
+    /// Starts in its stationary distribution. A process of size 0 draws nothing more.
     pub(crate) fn new(rms: f64, time_s: f64, mut noise: Random) -> Self {
         let value = rms * noise.normal();
         Self {

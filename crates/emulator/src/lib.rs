@@ -1,10 +1,10 @@
 //! The emulated rig: the board's own state machine, the physical world behind it and a rendered camera.
 //!
-//! [`World`] takes the board's output and the time, and delivers frames as a camera would, when a camera would. A frame shows
-//! a bead with a ring profile, or a cell in its channel. It is blurred along the true path during the exposure. It has shot
-//! and read noise, dust, uneven light and a focus that wanders (`Imperfections`). Runs that need no pictures get positions
-//! with the equivalent noise. The world also knows the truth. Faults come from a schedule ([`Faults`]). The only clock is the
-//! time that the caller passes.
+//! [`World`] takes the board's output and the time, and delivers frames with the timing of a camera. A frame shows a bead with a
+//! ring profile, or a cell in its channel, blurred along its true path during the exposure. It has shot and read noise, dust,
+//! uneven light and a wandering focus (`Imperfections`). Runs that need no pictures get positions with the equivalent noise. The
+//! world also gives the true positions. Faults come from a schedule ([`Faults`]). The only clock is the time that the caller
+//! passes.
 //!
 //! [`RigInABox`] joins the world to a [`Board`] on one clock; [`EmulatedRig`] puts both behind the traits of
 //! `cellpos-rig`, on the real clock or a virtual one. A seed fixes every bit of what comes out.

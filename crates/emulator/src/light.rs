@@ -1,16 +1,16 @@
-//! The light of the empty channel when it is not even: a slope, dark corners, a wall of the channel, specks of dust.
+//! Uneven light of the empty channel: a slope, dark corners, a wall of the channel, specks of dust.
 
 use crate::config::WorldConfig;
 use cellpos_numeric::Random;
 
-/// Light lost at the middle of a speck, grey levels, and its size (standard deviation), um: from one to the other.
+/// Ranges of the light lost at the middle of a speck, grey levels, and of its size (standard deviation), um.
 const DUST_GREY: (f64, f64) = (5.0, 20.0);
 const DUST_UM: (f64, f64) = (0.15, 0.4);
 /// Width of the line by which a wall shows (standard deviation), um, and the room between it and the outermost bead, um.
 const WALL_UM: f64 = 0.12;
 const WALL_ROOM_UM: f64 = 0.3;
 
-/// Grey level of each pixel, rows contiguous; empty when the light is the same all over the picture.
+/// Grey level of each pixel, rows contiguous; empty if the light is even.
 pub(crate) fn empty_channel(config: &WorldConfig) -> Vec<f32> {
     let it = config.imperfections();
     if it.has_even_light() || config.background_grey == 0.0 {

@@ -1,12 +1,12 @@
-//! A line to the board that misbehaves as USB and serial lines do: it stalls, takes a part of the bytes, loses bytes, is unplugged
-//! and returns. It repeats and reorders nothing.
+//! A line to the board with the faults of USB and serial lines: it stalls, accepts a part of the bytes, loses bytes, is unplugged
+//! and returns. It never repeats or reorders bytes.
 
 use cellpos_drivers::Port;
 use cellpos_numeric::Random;
 use cellpos_rig::Clock;
 use std::io::{Error, ErrorKind, Result};
 
-/// What goes wrong on a line, and how often. The default is nothing.
+/// The faults of a line and their rates. The default is no fault.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LineFaults {
     /// Stalls a second; the first frame after the start of a stall is cut in two.
@@ -17,9 +17,9 @@ pub struct LineFaults {
     pub part: f64,
     /// Probability that a byte is lost, in either direction.
     pub byte_loss: f64,
-    /// When the line is unplugged and when it is back, ns of the clock.
+    /// Times at which the line is unplugged and back, ns of the clock.
     pub unplugged_ns: Vec<[i64; 2]>,
-    /// When the line stalls whatever the dice say, and until when, ns of the clock.
+    /// Start and end of scheduled stalls, besides the random ones, ns of the clock.
     pub stalled_ns: Vec<[i64; 2]>,
 }
 
@@ -80,7 +80,7 @@ impl<P> MisbehavingLine<P> {
         this
     }
 
-    /// Has other faults from now on.
+    /// Sets other faults from now on.
     pub fn misbehave(&mut self, faults: LineFaults) {
         self.faults = faults;
         self.draw_stall();

@@ -1,4 +1,4 @@
-//! What a bead looks like to the emulated camera.
+//! The look of a bead in the emulated camera.
 
 use cellpos_vision::RadialProfile;
 use cellpos_vision::profile::{RingProfile, SplineProfile};

@@ -41,7 +41,7 @@ impl PressurePartner {
         })
     }
 
-    /// The board's time moves on.
+    /// Advances the board's time.
     pub(crate) fn tick(&mut self, now_us: u64) {
         self.board.tick(now_us);
         self.applied_um = um_from_picometres(self.board.applied_pm());

@@ -1,4 +1,4 @@
-//! Which keys of `[board]` and `[emulator]` may be written with a unit.
+//! The keys of `[board]` and `[emulator]` that may have a unit.
 
 use cellpos_plant::quantities::Quantity;
 

@@ -1,8 +1,8 @@
-//! From positions of beads and cells to grey values.
+//! Renders positions of beads and cells as grey values.
 //!
-//! Only the neighbourhood of an object is computed; everything else is background. Its noise is drawn once into a long strip of grey
-//! values, and each row takes a piece at a random place. A piece comes again after a hundred
-//! thousand pixels, at another place of another frame.
+//! It computes only the neighbourhood of an object; everything else is background. The background's noise is drawn once into a long strip
+//! of grey values, and each row uses a piece at a random place. A piece recurs after a hundred thousand pixels, at another place of
+//! another frame.
 
 use crate::cell_picture::{CellPicture, HalfAxes, walls};
 use crate::config::WorldConfig;
@@ -11,7 +11,7 @@ use crate::look::Look;
 use cellpos_numeric::Random;
 use cellpos_vision::{PixelResponse, RadialProfile, Template};
 
-/// A bead's path is replaced by points no further apart than this; the error of the blur is of second order in it.
+/// Largest spacing of the points that replace a bead's path; the error of the blur is of second order in it.
 const POINT_SPACING_PX: f64 = 0.25;
 const MAX_POINTS: usize = 16;
 /// Small enough to stay in a core's own cache.
@@ -20,7 +20,7 @@ const STRIP_LEN: usize = 1 << 17;
 const LED_GREY: f64 = 60.0;
 const GAUSSIAN_LEN: usize = 1 << 14;
 
-/// Points that stand for the path of a bead during an exposure, px.
+/// Points that represent the path of a bead during an exposure, px.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Blur {
     points: [(f32, f32); MAX_POINTS],
@@ -80,7 +80,7 @@ pub(crate) fn mean_between(path: &[(f64, f64)], from: f64, to: f64) -> (f64, f64
     let (mut x, mut y) = (0.0, 0.0);
     let (mut u, mut a) = (from, at(from));
     while u < to {
-        // Never negative: cutting off is rounding down, and no call.
+        // Never negative, so a cast rounds down without a function call.
         let next = ((u as usize + 1) as f64).min(to);
         let b = at(next);
         x += 0.5 * (a.0 + b.0) * (next - u);
@@ -170,7 +170,7 @@ impl Renderer {
         })
     }
 
-    /// A bead that went along a path, px; its ring is larger by `defocus`, a fraction.
+    /// A bead that moved along a path, px; its ring is larger by the fraction `defocus`.
     pub(crate) fn bead(&self, path: &[(f64, f64)], defocus: f64) -> Body {
         Body {
             blur: Blur::along(path),
@@ -178,7 +178,7 @@ impl Renderer {
         }
     }
 
-    /// A cell that went along a path, px.
+    /// A cell that moved along a path, px.
     pub(crate) fn cell(&self, path: &[(f64, f64)], length_um: f64, width_um: f64) -> Body {
         let px = |um: f64| um / self.pixel_um;
         Body {
@@ -335,7 +335,7 @@ impl Renderer {
     }
 }
 
-/// Adds `value` of the distance from `x` to the pixels of a row within `half` of it.
+/// Adds `value`, a function of the distance from `x`, to the pixels of a row within `half` of `x`.
 fn add_chord(values: &mut [f32], x: f32, half: f32, value: impl Fn(f32) -> f32) {
     // `as` takes what is below 0 to 0.
     let from = (x - half).ceil() as usize;
@@ -353,10 +353,10 @@ fn grey(level: f32) -> u8 {
     (level + 0.5) as u8
 }
 
-/// Smallest standard deviation of x that any unbiased localiser can reach on the rendered frames of a bead (or a cell at
-/// rest) in mid-frame, um: the Cramer-Rao bound for position, contrast and background unknown.
+/// The Cramer-Rao bound of x with unknown position, contrast and background, um: the smallest standard deviation that an unbiased
+/// localiser can reach on rendered frames. For a bead (or a cell at rest) in mid-frame.
 ///
-/// By symmetry x is uncorrelated with y, contrast and background, so the information of x alone decides.
+/// By symmetry x is uncorrelated with y, contrast and background, so only the information of x matters.
 pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
     let profile = Look::new(config.bead_look, config.bead_radius_px())?;
     let picture = CellPicture::new(config.pixel_um, &config.cell.unwrap_or_default());
@@ -387,7 +387,7 @@ pub(crate) fn localisation_bound_um(config: &WorldConfig) -> Option<f64> {
             let (dx, dy) = (f64::from(x) - x0, f64::from(y) - y0);
             let slope = config.contrast_grey * slope(dx, dy);
             let level = (config.background_grey + config.contrast_grey * value(dx, dy)).max(0.0);
-            // Rounding to whole grey levels adds a twelfth.
+            // Rounding to whole grey levels adds a variance of 1/12.
             let variance = level / config.electrons_per_grey
                 + config.read_noise_grey * config.read_noise_grey
                 + 1.0 / 12.0;

@@ -1,7 +1,7 @@
 //! Board and world joined on one clock: bytes of the host in, bytes of the board and camera frames out.
 //!
-//! The box is advanced to given times and acts at its own exact instants in between: the board's output steps every
-//! update period while it moves, the world holds it from step to step. So the same code serves the virtual clock, bit by bit
+//! The caller advances the box to given times; in between the box acts at its own exact instants. A moving output of the board
+//! steps every update period, and the world holds it from step to step. So the same code serves the virtual clock, bit by bit
 //! deterministic, and the real one. Not a driver: ports, sockets and sleeping are the caller's.
 
 use crate::board_config::{BoardConfig, BoardConfigError};
@@ -15,7 +15,7 @@ use cellpos_link::um_from_picometres;
 use cellpos_numeric::Random;
 use cellpos_plant::Model;
 
-/// Why there is no such box.
+/// The reason why such a box cannot be built.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum BoxError {
     /// The board cannot be.
@@ -29,7 +29,7 @@ pub enum BoxError {
 /// Longest burst of random bytes on the line.
 const GARBAGE_LEN: usize = 24;
 
-/// The board, what hangs on it, and the camera. Times are nanoseconds of the caller's clock.
+/// The board, the rig behind it, and the camera. Times are nanoseconds of the caller's clock.
 #[derive(Debug, Clone)]
 pub struct RigInABox {
     board: Board,
@@ -44,10 +44,10 @@ pub struct RigInABox {
 }
 
 impl RigInABox {
-    /// A board that has just been switched on, with its world, at `start_ns`.
+    /// A board that was just switched on, with its world, at `start_ns`.
     ///
     /// # Errors
-    /// [`BoxError`] names the value that cannot be.
+    /// [`BoxError`] names the invalid value.
     pub fn new(
         board: BoardConfig,
         world: &WorldConfig,
@@ -72,7 +72,7 @@ impl RigInABox {
     /// The same with a slow partner of the PZT.
     ///
     /// # Errors
-    /// Its board cannot be.
+    /// The board of the partner is invalid.
     pub fn with_partner(mut self, config: &PressureConfig) -> Result<Self, BoxError> {
         self.world.partner = Some(PressurePartner::new(config)?);
         Ok(self)
@@ -203,7 +203,7 @@ impl RigInABox {
             .saturating_add(self.start_ns)
     }
 
-    /// When the next burst comes after `now_ns`.
+    /// Time of the next burst after `now_ns`.
     fn garbage_after(&mut self, now_ns: i64) -> Option<i64> {
         const MS_NS: i64 = 1_000_000;
         let faults = &self.world.config().faults;

@@ -1,6 +1,7 @@
-//! A rendered scene that is hard to see in: several beads, dust, uneven and flickering light, defocus, motion blur.
+//! A rendered scene that is difficult for vision: several beads, dust, uneven and flickering light, defocus, motion
+//! blur.
 //!
-//! For trying vision, not for closing a loop: nothing moves by command here. The rig with its plant is
+//! For tests of vision, not for a closed loop: nothing here follows a command. The rig with its plant is
 //! [`EmulatedRig`](crate::EmulatedRig). A seed fixes every picture to the bit.
 
 use cellpos_numeric::Random;
@@ -10,7 +11,7 @@ use cellpos_vision::{RadialProfile, RingProfile};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
-/// Points that stand for a bead's path during the exposure.
+/// Number of points that represent a bead's path during the exposure.
 const BLUR_POINTS: usize = 5;
 
 /// A bead of the scene.
@@ -57,7 +58,7 @@ pub struct SceneConfig {
     pub height_px: usize,
     /// Frame rate, Hz.
     pub rate_hz: f64,
-    /// Share of the frame interval that is exposed, 0 to 1.
+    /// Exposure as a share of the frame interval, 0 to 1.
     pub exposure_share: f64,
     /// Light at the middle of the frame, grey levels.
     pub background_grey: f64,
@@ -142,7 +143,7 @@ pub struct SceneError {
     pub must_be: &'static str,
 }
 
-/// The camera that looks at the scene.
+/// The camera of the scene.
 #[derive(Debug)]
 pub struct SceneCamera {
     config: SceneConfig,
@@ -161,7 +162,7 @@ impl SceneCamera {
     /// A camera before its first frame.
     ///
     /// # Errors
-    /// Names the first key that cannot be used.
+    /// The error names the first invalid key.
     pub fn new(config: SceneConfig, clock: Clock) -> Result<Self, SceneError> {
         let range = |key, value: f64, low: f64, high: f64, must_be| {
             if value >= low && value <= high {
@@ -254,7 +255,7 @@ impl SceneCamera {
         })
     }
 
-    /// Where the beads are in the newest frame (middle of the exposure), px.
+    /// Positions of the beads in the newest frame (middle of the exposure), px.
     pub fn places(&self) -> &[(f64, f64)] {
         &self.places
     }

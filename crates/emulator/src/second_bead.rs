@@ -1,10 +1,10 @@
-//! How beads diffuse across the channel and next to each other, carried by the same flow.
+//! Diffusion of two beads across the channel and relative to each other, in the same flow.
 
 use cellpos_numeric::Random;
 
 /// The place of the second bead after a step, along the channel from the first and across the channel, um. Both diffuse: their
-/// distance along the channel spreads with twice the variance. Hard spheres in one plane do not pass through each other: a move
-/// that brings the centres nearer than a diameter is not made. `room_um` is the diameter and the largest distance across.
+/// distance along the channel spreads with twice the variance. Hard spheres in one plane cannot pass through each other, so a
+/// move that brings the centres nearer than a diameter is dropped. `room_um` is the diameter and the largest distance across.
 pub(crate) fn diffuse(
     (along, across): (f64, f64),
     own_across: f64,
@@ -17,7 +17,7 @@ pub(crate) fn diffuse(
         confined(across + spread_um * random.normal(), most_across_um),
     );
     let apart = |(x, y): (f64, f64)| f64::hypot(x, y - own_across);
-    // Where the two overlap from the start they may part.
+    // If the two overlap from the start they may separate.
     let nearest_um = diameter_um.min(apart((along, across)));
     if apart(moved) < nearest_um {
         (along, across)

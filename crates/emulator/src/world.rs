@@ -39,13 +39,13 @@ pub struct World {
     chain: Chain,
     pub(crate) partner: Option<PressurePartner>,
     zero_flow: ZeroFlow,
-    /// Where the zero flow is now, um from the mean.
+    /// Present zero flow, um from the mean.
     zero_flow_um: f64,
     focus: Wander,
     defocus: f64,
     /// Of the angle between the rows of the picture and the channel.
     sin_cos: (f64, f64),
-    /// How far across the channel the bead goes, um.
+    /// Range of the bead across the channel, um.
     most_lateral_um: f64,
     camera: Camera,
     renderer: Renderer,
@@ -68,7 +68,7 @@ pub struct World {
     led: bool,
     has_events: bool,
     cell: Option<Cell>,
-    /// Picture and position that a frame grabber that hangs would give again.
+    /// Picture and position that a hanging frame grabber repeats.
     newest_picture: Vec<u8>,
     newest_position: Option<PositionFix>,
 }
@@ -76,11 +76,11 @@ pub struct World {
 impl World {
     /// A world at `start_ns` with the bead at [`WorldConfig::start_um`] and the PZT resting at neutral.
     ///
-    /// The configuration's neutral and diffusion take the place of the model's; effects of the model at the camera's
-    /// place (delay, exposure, drops, repeats, clock skew) take the place of the configuration's figures.
+    /// The configuration's neutral and diffusion replace the model's. The model's effects at the camera's place (delay, exposure, drops,
+    /// repeats, clock skew) replace the configuration's values.
     ///
     /// # Errors
-    /// [`WorldError`] names the value that cannot be.
+    /// [`WorldError`] names the invalid value.
     pub fn new(config: &WorldConfig, model: &Model, start_ns: i64) -> Result<Self, WorldError> {
         config.validate()?;
         let it = config.imperfections();
@@ -181,8 +181,8 @@ impl World {
         self.chain.pzt_um()
     }
 
-    /// True zero flow now: the displacement at which the wandering, drifting and stepping flow stands still, um. The steady flow of
-    /// [`WorldConfig::drift_um_per_s`] is not in it.
+    /// True zero flow now, um: the displacement at which the wandering, drifting and stepping flow is zero. It does not include the
+    /// steady flow of [`WorldConfig::drift_um_per_s`].
     pub fn zero_flow_um(&self) -> f64 {
         self.config.neutral_um + self.zero_flow_um
     }
@@ -205,7 +205,7 @@ impl World {
     /// nothing in a world with the same seed.
     ///
     /// # Errors
-    /// [`WorldError`] names the value that cannot be.
+    /// [`WorldError`] names the invalid value.
     pub fn empty_frames(config: &WorldConfig, count: usize) -> Result<Vec<Vec<u8>>, WorldError> {
         config.validate()?;
         let other = WorldConfig {
@@ -223,8 +223,8 @@ impl World {
 
     /// Advances to `t_ns` with the board's output at `applied_um`; does nothing for a past time.
     ///
-    /// A new output takes effect at the world's present time: call this up to the instant of the change with the old output, then
-    /// continue with the new one.
+    /// A new output takes effect at the world's present time. So advance to the instant of the change with the old output, then continue
+    /// with the new one.
     pub fn advance_to(&mut self, t_ns: i64, applied_um: f64) {
         loop {
             let sample_ns = self.camera.next_sample_ns();
@@ -273,7 +273,7 @@ impl World {
         }
     }
 
-    /// What the amplifier makes of the board's output, um.
+    /// Output of the amplifier for the board's output, um.
     fn reached_um(&self, applied_um: f64) -> f64 {
         let flipped_um = if self.active(FaultKind::GainFlip) {
             2.0 * self.config.neutral_um - applied_um
@@ -328,7 +328,7 @@ impl World {
         }
     }
 
-    /// Where the camera sees what is at `x_um`: the model's effects on light and table.
+    /// Position at which the camera sees an object at `x_um`: the model's effects on light and table.
     fn apparent_um(&mut self, x_um: f64) -> f64 {
         let t_s = (self.now_ns - self.start_ns) as f64 * 1e-9;
         let mut seen_um = x_um;
@@ -348,7 +348,7 @@ impl World {
             return;
         }
         let since_ns = *self.out_since_ns.get_or_insert(self.now_ns);
-        // A bead that crosses the frame in less than five hundred exposures is no use to anybody.
+        // A bead that crosses the frame in less than five hundred exposures is useless.
         let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s;
         let field_um = f64::from(self.config.width_px) * self.config.pixel_um;
         let slow = flow_um_per_s.abs() < 0.002 * field_um * self.config.rate_hz;
@@ -363,8 +363,7 @@ impl World {
         self.led = on;
     }
 
-    /// When the next frame will be delivered, ns, of those exposed so far. Exposures still to come are delivered later than
-    /// that, unless frames are reordered.
+    /// Delivery time of the next frame that is already exposed, ns. Later exposures are delivered later, unless frames are reordered.
     pub fn next_delivery_ns(&self) -> Option<i64> {
         self.camera.next_delivery_ns()
     }
@@ -413,7 +412,7 @@ impl World {
         Some(info)
     }
 
-    /// The position in the next frame that has been delivered by now, with the noise that its picture would give.
+    /// The position in the next frame delivered by now, with the noise that its picture would give.
     ///
     /// Frames and positions come from the same queue: take either the one or the other.
     pub fn take_position(&mut self) -> Option<PositionFix> {

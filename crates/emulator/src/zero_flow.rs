@@ -1,6 +1,6 @@
-//! The zero flow: the displacement at which the flow stands still, and how it moves.
+//! The zero flow, that is the displacement at which the flow is zero, and its changes.
 //!
-//! A syringe, its tubes and the heights of the reservoirs never stand still: the zero flow wanders about its mean
+//! A syringe, its tubes and the levels of the reservoirs are never quite still, so the zero flow wanders about its mean
 //! (Ornstein-Uhlenbeck) and drifts. A tap on the syringe makes it step.
 
 use crate::config::WorldConfig;
@@ -17,7 +17,7 @@ pub(crate) struct ZeroFlow {
 }
 
 impl ZeroFlow {
-    /// At its mean, but for the part that wanders, which starts where it would be after a long time.
+    /// Starts at its mean; only the wandering part starts in its stationary distribution.
     pub(crate) fn new(config: &WorldConfig) -> Self {
         let it = config.imperfections();
         let noise = Random::stream(config.seed, 31);

@@ -68,7 +68,7 @@ impl core::error::Error for EncodeError {}
 /// # Errors
 /// [`EncodeError::OutputTooShort`]; nothing of `out` may be sent then.
 pub fn encode<M: Message>(message: &M, out: &mut [u8]) -> Result<usize, EncodeError> {
-    // No index that can fail: the firmware that links this has no panic path.
+    // Avoid indexing that can fail: the firmware with this code must have no panic path.
     let mut body = [0_u8; MAX_BODY];
     let (direction, payload) = body.split_first_mut().ok_or(EncodeError::MessageTooLong)?;
     *direction = M::DIRECTION;
@@ -93,10 +93,10 @@ pub fn encode<M: Message>(message: &M, out: &mut [u8]) -> Result<usize, EncodeEr
     Ok(encoded + 2)
 }
 
-/// Takes bytes as they come, in pieces of any size, and yields the messages of one direction.
+/// Takes bytes in pieces of any size, and yields the messages of one direction.
 ///
-/// Drops and counts a frame that is too long, not COBS, fails the CRC, has the other direction's byte or is no message. Decoding
-/// continues at the next delimiter. Never panics, never allocates, holds at most one frame.
+/// Drops and counts a frame that is too long, not COBS, fails the CRC, has the other direction's byte or is not a message.
+/// Decoding continues at the next delimiter. Never panics, never allocates, holds at most one frame.
 #[derive(Debug, Clone)]
 pub struct Decoder<M> {
     buffer: [u8; MAX_ENCODED],

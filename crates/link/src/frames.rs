@@ -1,4 +1,4 @@
-//! Camera frames on a stream socket: how the emulated rig hands its frames to a host.
+//! Camera frames on a stream socket: the format in which the emulated rig sends frames to a host.
 //!
 //! Each frame is a header of [`HEADER_LEN`] bytes and `payload_len` bytes of pixels. Rows are contiguous. A pixel is one byte up
 //! to 8 bits, else two in little-endian order. All numbers of the header are little-endian:
@@ -33,7 +33,7 @@ const MAGIC: [u8; 4] = *b"CPFR";
 const VERSION: u16 = 1;
 static CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
 
-/// What is known of a frame besides its pixels.
+/// Data of a frame besides its pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameHeader {
     /// Rises by one per exposed frame.
@@ -52,7 +52,7 @@ pub struct FrameHeader {
     pub bits: u16,
 }
 
-/// Why a header was refused. The stream is out of step: connect again.
+/// The reason why a header was refused. The stream is out of step: connect again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HeaderError {
     /// The first bytes are not the magic.
@@ -110,7 +110,7 @@ impl FrameHeader {
         usize::from(self.width) * usize::from(self.height) * per_pixel
     }
 
-    /// The header as it goes over the socket.
+    /// The header in its form on the socket.
     pub fn to_bytes(&self) -> [u8; HEADER_LEN] {
         let mut bytes = [0; HEADER_LEN];
         bytes[0..4].copy_from_slice(&MAGIC);
@@ -176,7 +176,7 @@ fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
 
 /// Gathers frames from the pieces in which a stream delivers them.
 ///
-/// The buffer for the pixels grows to the first frame's size and is then used again and again.
+/// The buffer for the pixels grows to the first frame's size and is then reused.
 #[cfg(feature = "std")]
 #[derive(Debug)]
 pub struct FrameGatherer {

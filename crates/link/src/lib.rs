@@ -1,9 +1,9 @@
-//! Wire protocol between the host and the PZT board: what is said, and how it is framed on a byte stream.
+//! Wire protocol between the host and the PZT board: the messages, and their framing on a byte stream.
 //!
 //! A frame on the wire is `0x00, COBS(direction, postcard(message), CRC-32), 0x00`. The zero in front costs one byte;
-//! with it, garbage before a frame never destroys the frame. The direction byte prevents that an echo is taken for an
-//! answer. Lengths and displacements travel as whole picometres: a 16-bit converter over 40 um steps by
-//! 610 pm, so nothing is lost between the host's number and the code.
+//! thanks to it, garbage before a frame never destroys the frame. The direction byte distinguishes an echo from an
+//! answer. Lengths and displacements travel as whole picometres: a 16-bit converter over 40 um steps by 610 pm, so
+//! nothing is lost between the host's number and the code.
 //!
 //! The same code runs in the host's driver and on the board: no standard library, no allocation, no clock. Not for the
 //! transport itself; see [`frames`] for the camera's stream of the emulated rig.

@@ -18,9 +18,9 @@ pub enum ToBoard {
     },
     /// Starts a session: clears a latched fault, holds the present displacement, waits for commands.
     Arm(Arm),
-    /// Where the PZT has to be from now on.
+    /// The displacement of the PZT from now on.
     Command(Command),
-    /// Slew to the last zero-flow estimate and hold it there: the bead all but stops.
+    /// Slew to the last zero-flow estimate and hold it there: the bead almost stops.
     Freeze,
     /// Slew-limited ramp to the park displacement; latched until the next [`ToBoard::Arm`].
     Park,
@@ -40,19 +40,19 @@ pub enum ToBoard {
     },
 }
 
-/// How a session is to be run.
+/// Settings of a session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Arm {
-    /// Number of the session, drawn at random by the host, so that two hosts differ. Commands of another session are ignored and
-    /// counted.
+    /// Random number of the session, chosen by the host so that two hosts differ. The board ignores and counts commands of
+    /// another session.
     pub session: u16,
-    /// Without a fresh command for this long while running, the board goes to the last zero-flow estimate and holds it.
-    /// `None`: the board's default.
+    /// After this time without a new command while running, the board moves to the last zero-flow estimate and holds it. `None`:
+    /// the board's default.
     pub watchdog_ms: Option<u16>,
-    /// After it held for this long (holding, frozen, or armed without a first command) the board ramps to park. `None`: the
+    /// After holding for this time (holding, frozen, or armed without a first command) the board ramps to park. `None`: the
     /// board's default.
     pub hold_watchdog_ms: Option<u16>,
-    /// Where a ramp to park ends. `None`: the board's default.
+    /// Displacement at the end of a ramp to park. `None`: the board's default.
     pub park_pm: Option<i32>,
     /// Limits tighter than the board's own.
     pub limits: Option<Limits>,
@@ -95,12 +95,12 @@ pub struct Command {
     pub session: u16,
     /// Sequence number, rising by one (wraps around; compared with [`crate::order`]).
     pub seq: u32,
-    /// Host time at which it was handed over, us since arming: shows commands that were held up on their way.
+    /// Host time of its hand-over, us since arming: shows commands that were delayed on their way.
     pub time_us: u64,
     /// Commanded PZT displacement, pm.
     pub displacement_pm: i32,
-    /// The host's running estimate of the zero-flow displacement, at which the bead is at rest, pm: where a freeze and a
-    /// board that hears no more commands go.
+    /// The host's running estimate of the zero-flow displacement, at which the bead is at rest, pm. It is the target of a freeze,
+    /// and of a board without further commands.
     pub neutral_pm: i32,
 }
 
@@ -181,7 +181,7 @@ pub enum Request {
     Led,
 }
 
-/// Why a request was not carried out.
+/// The reason for refusing a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Refusal {
     /// Host and board speak different versions of the protocol, or no hello came first.
@@ -208,15 +208,15 @@ pub enum BoardState {
     Armed = 1,
     /// Following commands.
     Running = 2,
-    /// Holding the zero-flow estimate because the host said so; only arm, park and disarm leave this state.
+    /// Holding the zero-flow estimate on the host's request; only arm, park and disarm leave this state.
     Frozen = 3,
     /// Ramping to park or there; latched: only arm and disarm leave this state.
     Safe = 4,
-    /// Holding the zero-flow estimate because commands stopped; a fresh command takes up again.
+    /// Holding the zero-flow estimate because commands stopped; a new command resumes.
     Holding = 5,
 }
 
-/// Why the board stopped following commands without a request.
+/// The reason why the board stopped following commands without a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum Fault {
@@ -253,14 +253,14 @@ pub struct Status {
     pub led: bool,
     /// Frames that failed the length, COBS, CRC or content check.
     pub bad_frames: u32,
-    /// Commands ignored: old, doubled, reordered, of another session, or in a state that takes none.
+    /// Ignored commands: old, doubled, reordered, of another session, or in a state that accepts none.
     pub ignored: u32,
-    /// Commands held up on their way for longer than the board's allowance; they are still obeyed.
+    /// Commands delayed on their way by more than the board's allowance; the board still obeys them.
     pub late: u32,
     /// Commands clipped to the range.
     pub clipped: u32,
     /// Messages to the host dropped because they were not collected.
     pub unsent: u32,
-    /// How often in this session the board held because commands stopped.
+    /// Number of holds in this session because commands stopped.
     pub holds: u16,
 }

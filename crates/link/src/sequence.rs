@@ -1,6 +1,6 @@
 //! Order of sequence numbers that wrap around.
 
-/// How a sequence number stands to the last one accepted.
+/// Relation of a sequence number to the last accepted one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     /// Newer; `skipped` numbers are missing in between.

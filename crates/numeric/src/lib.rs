@@ -1,7 +1,7 @@
-//! Numbers as every crate uses them: [`units`], seeded random numbers, order [`statistics`], distributions, and a [`parallel`] map.
+//! Numerical tools shared by all crates: [`units`], seeded random numbers, order [`statistics`], distributions, and a [`parallel`] map.
 //!
-//! Each exists once here, so that two crates cannot disagree about the meaning of a quantile or a seed. It is not a
-//! statistics library: distribution functions come from `statrs`.
+//! Each tool exists only here, so that two crates cannot disagree about the meaning of a quantile or a seed. This is not a statistics
+//! library: distribution functions come from `statrs`.
 //!
 //! ```
 //! use cellpos_numeric::{Random, statistics};

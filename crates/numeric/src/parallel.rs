@@ -1,4 +1,4 @@
-//! A map over items on a few threads whose result does not depend on the number of threads: fits, folds, seeds of a table.
+//! A map over items on a few threads, for fits, folds, or seeds of a table. The result does not depend on the number of threads.
 //!
 //! Not for a loop: threads are started and joined, and results wait for a lock.
 //!
@@ -44,7 +44,7 @@ pub fn map<T: Sync, R: Send>(items: &[T], threads: usize, of: impl Fn(&T) -> R +
     done.into_iter().map(|(_, result)| result).collect()
 }
 
-/// Threads for a number that was asked for: all cores for 0.
+/// Number of threads for a requested number: all cores for 0.
 pub fn threads(asked: usize) -> usize {
     match asked {
         0 => std::thread::available_parallelism().map_or(1, usize::from),

@@ -13,7 +13,7 @@ pub struct Random {
 }
 
 impl Random {
-    /// The numbers that belong to `seed`.
+    /// The sequence of a `seed`.
     pub fn new(seed: u64) -> Self {
         Self {
             generator: Xoshiro256PlusPlus::seed_from_u64(seed),
@@ -21,8 +21,8 @@ impl Random {
         }
     }
 
-    /// The stream number `stream` of `seed`: one for each purpose, so that switching one source of noise off leaves the
-    /// numbers of the others as they are.
+    /// Stream number `stream` of `seed`. Each purpose has its own stream, so that switching off one source of noise
+    /// does not change the numbers of the others.
     pub fn stream(seed: u64, stream: u64) -> Self {
         // An odd multiplier keeps the streams of one seed apart; the generator's own seeding mixes the rest.
         Self::new(seed.wrapping_add(stream.wrapping_mul(0x9e37_79b9_7f4a_7c15)))

@@ -1,7 +1,7 @@
 //! Distributions for tests and intervals (chi-squared, Student's t, Fisher's F), and quantiles of samples.
 //!
-//! The distribution functions are those of `statrs`; here they have the arguments that this project needs, and quantiles
-//! that hold for any real number of degrees of freedom.
+//! The distribution functions come from `statrs`. This module gives them the arguments that this project needs, and quantiles for
+//! any real number of degrees of freedom.
 
 use statrs::function::beta::beta_reg;
 use statrs::function::gamma::{gamma_lr, gamma_ur};

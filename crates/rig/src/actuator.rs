@@ -1,4 +1,4 @@
-//! The PZT actuator as the loop's I/O thread sees it.
+//! The PZT actuator from the view of the loop's I/O thread.
 //!
 //! The types belong to the loop, not to one board. An analogue output card, a network controller and the project's own board all
 //! report an [`ActuatorState`] and an [`ActuatorFault`].
@@ -6,7 +6,7 @@
 use serde::Serialize;
 use std::time::Duration;
 
-/// What an actuator does at present. The numbers are those of a run's record.
+/// Present state of an actuator. The numbers are those of a run's record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[repr(u8)]
 pub enum ActuatorState {
@@ -16,11 +16,11 @@ pub enum ActuatorState {
     Armed = 1,
     /// Follows commands.
     Running = 2,
-    /// Holds the zero-flow displacement because it was told to ([`Actuator::freeze`]); only a new session leaves this.
+    /// Holds the zero-flow displacement on request ([`Actuator::freeze`]); only a new session leaves this.
     Frozen = 3,
     /// Parks or is parked; latched: only a new session leaves this.
     Safe = 4,
-    /// Holds the zero-flow displacement because commands stopped; continues with a fresh command.
+    /// Holds the zero-flow displacement because commands stopped; continues with the next new command.
     Holding = 5,
 }
 
@@ -84,7 +84,7 @@ impl ActuatorFault {
     }
 }
 
-/// What an actuator can do, by its own report.
+/// Limits of an actuator, from its own report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ActuatorInfo {
     /// Kind, serial number, version of its firmware.
@@ -97,16 +97,16 @@ pub struct ActuatorInfo {
     pub slew_um_per_s: f64,
     /// One step of the converter, um; 0 if unknown.
     pub step_um: f64,
-    /// Default time without a fresh command after which it stops following, ms.
+    /// Default time without a new command after which it stops following, ms.
     pub watchdog_ms: u16,
     /// Default time that it then holds before it parks, ms.
     pub hold_watchdog_ms: u16,
 }
 
-/// The newest that an actuator has said.
+/// The newest report of an actuator.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ActuatorReport {
-    /// Session that it is in, [`ArmRequest::session`]: another number than one's own means that another host armed it.
+    /// Its present session, [`ArmRequest::session`]: a foreign number means that another host armed it.
     pub session: u16,
     /// State.
     pub state: ActuatorState,
@@ -118,19 +118,19 @@ pub struct ActuatorReport {
     pub last_seq: Option<u32>,
     /// Host time of that command, us since arming.
     pub last_time_us: u64,
-    /// The actuator's own clock, us since its start: spacing of commands as it saw them.
+    /// The actuator's own clock at the report, us since its start: shows the spacing of commands at arrival.
     pub device_time_us: u64,
     /// Frames that it could not read.
     pub bad_frames: u32,
-    /// Commands that it ignored: old, doubled, of another session, or in a state that takes none.
+    /// Ignored commands: old, doubled, of another session, or in a state that accepts none.
     pub ignored: u32,
-    /// How often in this session it held because commands stopped. The count shows holds between two reports, too.
+    /// Number of holds in this session because commands stopped. It also counts holds between two reports.
     pub holds: u16,
     /// When the report was read, ns of the run's clock.
     pub read_ns: i64,
 }
 
-/// The newest that a slow partner of the actuator has said.
+/// The newest report of the actuator's slow partner.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartnerReport {
     /// State.
@@ -172,7 +172,7 @@ pub enum ActuatorError {
         actuator: String,
         /// What was asked.
         request: &'static str,
-        /// Why not, and what would be right.
+        /// The reason, and what would be right.
         reason: String,
     },
     /// A command that is not a number; nothing was sent.
@@ -197,32 +197,32 @@ pub enum ActuatorError {
     },
 }
 
-/// How a session is to be run.
+/// Settings of a session.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmRequest {
-    /// Number of the session, drawn at random so that two hosts at one actuator differ.
+    /// Number of the session, random, so that two hosts at one actuator differ.
     pub session: u16,
     /// Where a ramp to park ends, um.
     pub park_um: f64,
     /// Smallest and largest displacement (um) and slew (um/s) of this session, at most the actuator's own.
     pub limits: [f64; 3],
-    /// Without a fresh command for this long it stops following and holds the zero-flow displacement, ms; `None` leaves
-    /// the actuator's own.
+    /// After this time without a new command it stops following and holds the zero-flow displacement, ms; `None` leaves the
+    /// actuator's own.
     pub watchdog_ms: Option<u16>,
-    /// When it has held for this long it parks, ms; `None` leaves the actuator's own.
+    /// After holding for this time it parks, ms; `None` leaves the actuator's own.
     pub hold_watchdog_ms: Option<u16>,
 }
 
-/// What became of the commands of a session, as far as the actuator's reports say.
+/// The fate of a session's commands, from the actuator's reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct CommandAccount {
     /// Commands handed over.
     pub commands: u64,
-    /// Commands that a report has named as obeyed.
+    /// Commands that a report names as obeyed.
     pub answered: u64,
     /// Commands that the line did not take before a newer one replaced them.
     pub not_taken: u64,
-    /// Commands that the reports passed over: a later one was named, these never were.
+    /// Commands that the reports skipped: a report named a later one, but never these.
     pub passed_over: u64,
 }
 
@@ -232,7 +232,7 @@ impl CommandAccount {
         self.passed_over.max(self.not_taken)
     }
 
-    /// Commands that were lost, once nothing is on its way any more.
+    /// Lost commands, once no command is on its way any more.
     pub fn lost_in_all(&self) -> u64 {
         self.commands.saturating_sub(self.answered)
     }
@@ -240,8 +240,8 @@ impl CommandAccount {
 
 /// A PZT actuator. Called from the actuator thread only; may block.
 ///
-/// An error of the line is no end: what was to be sent is lost, and the next call tries again. Only silence of the actuator
-/// ends a run.
+/// An error of the line does not end a run: the message is lost, and the next call tries again. Only silence of the actuator ends
+/// a run.
 ///
 /// An actuator enforces range and slew of its session at its output, and reacts to silence: a killed host must end in park.
 pub trait Actuator: Send {
@@ -252,7 +252,7 @@ pub trait Actuator: Send {
     /// # Errors
     /// No answer, or a refusal.
     fn arm(&mut self, request: &ArmRequest) -> Result<ActuatorReport, ActuatorError>;
-    /// Hands over a displacement and the estimate of the zero-flow displacement, both um.
+    /// Sends a displacement and the estimate of the zero-flow displacement, both um.
     ///
     /// # Errors
     /// The line is broken.
@@ -282,10 +282,10 @@ pub trait Actuator: Send {
     /// # Errors
     /// The line is broken.
     fn poll(&mut self) -> Result<Option<ActuatorReport>, ActuatorError>;
-    /// Hands a command to the slow partner, um on the partner's scale. A failure there counts as silence of the partner, not as
-    /// an error of this actuator.
+    /// Sends a command to the slow partner, um on the partner's scale. A failure counts as silence of the partner, not as an
+    /// error of this actuator.
     fn command_partner(&mut self, _command_um: f64, _time_us: u64) {}
-    /// What the slow partner can do; `None` without one.
+    /// Limits of the slow partner; `None` without one.
     fn partner_info(&self) -> Option<ActuatorInfo> {
         None
     }
@@ -293,7 +293,7 @@ pub trait Actuator: Send {
     fn poll_partner(&mut self) -> Option<PartnerReport> {
         None
     }
-    /// What became of the commands of this session; `None` where the actuator does not say.
+    /// The fate of this session's commands; `None` if the actuator does not report it.
     fn account(&self) -> Option<CommandAccount> {
         None
     }

@@ -1,4 +1,4 @@
-//! The clock of a run: the machine's monotonic clock, or a virtual one that moves only when it is told to.
+//! The clock of a run: the machine's monotonic clock, or a virtual one that advances only by calls.
 //!
 //! Real-time stamps of cellpos are nanoseconds of `CLOCK_MONOTONIC`. A step of the calendar clock does not change them, and other
 //! processes on the machine (a camera server, the rig in a box) share them.
@@ -26,12 +26,12 @@ pub fn sleep_until_ns(deadline_ns: i64) {
     while clock_nanosleep_absolute(ClockId::Monotonic, &request) == Err(rustix::io::Errno::INTR) {}
 }
 
-/// Where the time of a run comes from.
+/// The source of a run's time.
 #[derive(Debug, Clone)]
 pub enum Clock {
     /// `CLOCK_MONOTONIC`.
     Real,
-    /// A number of nanoseconds that only [`Clock::sleep_until_ns`] and [`Clock::sleep`] move.
+    /// A number of nanoseconds that only [`Clock::sleep_until_ns`] and [`Clock::sleep`] advance.
     Virtual(Arc<AtomicI64>),
 }
 
@@ -41,7 +41,7 @@ impl Clock {
         Self::Virtual(Arc::new(AtomicI64::new(start_ns)))
     }
 
-    /// Whether time passes only when told to.
+    /// Whether time advances only by calls.
     pub fn is_virtual(&self) -> bool {
         matches!(self, Self::Virtual(_))
     }

@@ -1,9 +1,9 @@
-//! Account of frames by their ids and time stamps: which are new, doubled, late, lost, stale, or from the future.
+//! Classifies frames by their ids and time stamps: new, doubled, late, lost, stale, or from the future.
 //!
-//! The one place where this is decided: drivers that unwrap a camera's ids, vision and the loop all ask a
-//! [`FrameAccount`]. Camera stacks go stale silently, restart their count, and stamp with their own clocks. So neither the id nor
-//! the time stamp is trusted alone. Times are nanoseconds of the run's clock, which is monotonic: a change of
-//! the calendar clock cannot be seen here. Counting saturates and nothing is allocated.
+//! Only a [`FrameAccount`] decides this: drivers that unwrap a camera's ids, vision and the loop all use one. Camera stacks go
+//! stale silently, restart their count, and stamp with their own clocks. So it trusts neither the id nor the time stamp alone.
+//! Times are nanoseconds of the run's monotonic clock, which does not show a change of the calendar clock. Counts saturate, and
+//! nothing is allocated.
 
 /// How a camera counts its frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,19 +21,19 @@ pub enum IdKind {
 pub enum FrameKind {
     /// The first frame.
     First,
-    /// Newer than all before; `missed` ids lie between.
+    /// Newer than all before; `missed` ids are skipped.
     New {
         /// Missing frames (a late one is subtracted again, see [`FrameKind::Late`]).
         missed: u64,
     },
-    /// Newer than all before, from a camera that restarted its count: its ids continue from the last one. How many frames
-    /// were lost meanwhile is not known.
+    /// Newer than all before, from a camera that restarted its count: its ids continue from the last one. The number of frames
+    /// lost meanwhile is unknown.
     Restarted,
     /// An id that has come already.
     Doubled,
-    /// A frame that comes after its successor: it was counted as missed, and is not lost, but of no use.
+    /// A frame that comes after its successor: counted as missed before; it is not lost, but useless.
     Late,
-    /// A new id whose time stamp has not moved on, or an older id with a newer stamp: the picture is not to be trusted.
+    /// A new id whose time stamp has not advanced, or an older id with a newer stamp: the picture is unreliable.
     Stale,
     /// Its time stamp is in the future, by this many ns.
     Future {
@@ -45,7 +45,7 @@ pub enum FrameKind {
         /// Its age.
         age_ns: i64,
     },
-    /// An id that the camera never gives out (zero where zero is skipped).
+    /// An id that the camera never gives (zero, if it skips zero).
     Invalid,
 }
 
@@ -78,7 +78,7 @@ pub struct FrameCounts {
     pub late: u64,
     /// Frames whose time stamp says that the picture is not new, or too old.
     pub stale: u64,
-    /// Frames stamped with a time that has not come.
+    /// Frames stamped with a future time.
     pub future: u64,
     /// Number of restarts of the camera's count.
     pub restarts: u64,
@@ -116,8 +116,8 @@ const REMEMBERED: u64 = 64;
 const MOST_PER_PERIOD: i64 = 16;
 
 impl FrameAccount {
-    /// An account for a camera that counts as `kind` says and gives about a frame in `period_ns` (within a factor of 16). A
-    /// frame older than `oldest_ns` on arrival is too old; `i64::MAX` where somebody else judges that.
+    /// An account for a camera that counts as `kind` says and gives about a frame in `period_ns` (within a factor of 16). A frame
+    /// older than `oldest_ns` on arrival is too old; `i64::MAX` if other code judges that.
     pub fn new(kind: IdKind, period_ns: i64, oldest_ns: i64) -> Self {
         Self {
             kind,
@@ -210,8 +210,7 @@ impl FrameAccount {
         self.newest = Some(Newest {
             raw,
             id: newest.id.saturating_add(missed + 1),
-            // The id of a bad frame is used up all the same, so that the next one does not count it as lost; its stamp
-            // is not believed.
+            // Mark the id of a bad frame as used, so that the next frame does not count it as lost; ignore its stamp.
             exposed_ns: if bad.is_some() {
                 newest.exposed_ns
             } else {
@@ -257,7 +256,7 @@ impl FrameAccount {
         self.restart(newest, raw, exposed_ns, age_ns, newer)
     }
 
-    /// An id that the count before does not explain: two such in a row, one following the other, are a new count.
+    /// Takes an id that does not fit the count: two such ids in succession begin a new count.
     fn restart(
         &mut self,
         newest: Newest,
@@ -288,7 +287,7 @@ impl FrameAccount {
         FrameKind::Restarted
     }
 
-    /// What is wrong with an age, if anything is.
+    /// The fault of an age, if any.
     fn of_age(&self, age_ns: i64) -> Option<FrameKind> {
         // Stamps of another clock, translated, may be early by the noise of the translation.
         if age_ns < -self.period_ns / 2 {

@@ -17,8 +17,8 @@ pub struct Measurement {
     pub variance_um2: f64,
     /// Verdict of vision on the fix itself.
     pub verdict: FixQuality,
-    /// State of the tracker after this frame, and its decision; `None` without a tracker. A good fix that the
-    /// tracker did not take (another bead, too far from the prediction) has no position.
+    /// State of the tracker after this frame, and its decision; `None` without a tracker. A good fix that the tracker
+    /// refuses (another bead, too far from the prediction) has no position.
     pub track: Option<(TrackState, Decision)>,
     /// Peak contrast over pixel noise; NaN without picture.
     pub snr: f64,
@@ -37,7 +37,7 @@ pub struct Measurement {
 }
 
 impl Measurement {
-    /// Whether the position may be controlled on: a good fix, and the bead that is followed.
+    /// Whether the loop may use the position: a good fix of the tracked bead.
     pub fn is_usable(&self) -> bool {
         self.verdict == FixQuality::Good && self.position_um.is_finite()
     }

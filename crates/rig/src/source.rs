@@ -1,17 +1,17 @@
-//! What the loop asks of a camera and of a stream of positions.
+//! The interface of a camera and of a stream of positions.
 
 use crate::measurement::Measurement;
 use cellpos_vision::{Frame, Pixels};
 use serde::Serialize;
 
-/// What is known of a frame besides its pixels. Times are nanoseconds of the run's clock.
+/// Data of a frame besides its pixels. Times are nanoseconds of the run's clock.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameStamp {
     /// Unwrapped id, rising by one per exposed frame.
     pub id: u64,
     /// Middle of the exposure.
     pub mid_exposure_ns: i64,
-    /// Length of the exposure; 0 where the camera does not say.
+    /// Length of the exposure; 0 if the camera does not report it.
     pub exposure_ns: i64,
     /// Arrival in this process.
     pub arrival_ns: i64,
@@ -21,7 +21,7 @@ pub struct FrameStamp {
     pub true_pzt_um: f64,
 }
 
-/// Room for one frame, used again and again. Grows to the first frame's size and then allocates no more.
+/// A reusable buffer for one frame. It grows to the first frame's size and then allocates no more.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct FrameBuffer {
     /// Pixels per row.
@@ -62,7 +62,7 @@ impl FrameBuffer {
     }
 }
 
-/// Why a source gives no more frames. A frame that is only late or missing is no error.
+/// The reason why a source gives no more frames. A late or missing frame is not an error.
 #[derive(Debug, thiserror::Error)]
 pub enum CameraError {
     /// The camera, or the file or process behind it, is gone.
@@ -73,7 +73,7 @@ pub enum CameraError {
         /// What happened.
         problem: String,
     },
-    /// The stream is not what was promised.
+    /// The stream is not in the expected format.
     #[error("camera {camera}: {problem}; {remedy}")]
     Broken {
         /// Which camera.
@@ -104,7 +104,7 @@ pub struct SourceInfo {
 
 /// A camera: frames with ids and mid-exposure time stamps.
 pub trait Camera: Send {
-    /// Waits for the next frame until `deadline_ns` and copies it into `buffer`; `None` when none came in time.
+    /// Waits for the next frame until `deadline_ns` and copies it into `buffer`; `None` if no frame came in time.
     ///
     /// # Errors
     /// [`CameraError`] when there will be no more frames.
@@ -114,7 +114,7 @@ pub trait Camera: Send {
         deadline_ns: i64,
     ) -> Result<Option<FrameStamp>, CameraError>;
 
-    /// Where the bead truly is now, um, where anything knows (emulated rig only, else NaN): for moments without a frame.
+    /// True bead position now, um (emulated rig only, else NaN), for moments without a frame.
     fn truth_um(&mut self) -> f64 {
         f64::NAN
     }
@@ -150,15 +150,15 @@ pub struct SeenFrame<'a> {
     pub bits: u16,
     /// When it was exposed.
     pub stamp: FrameStamp,
-    /// Centre of the bead or cell that was taken, px; `None`: nothing was.
+    /// Centre of the accepted bead or cell, px; `None` without one.
     pub centre_px: Option<(f64, f64)>,
     /// Half its width along the columns and the rows, px.
     pub half_px: (f64, f64),
-    /// Outline of the cell, px; empty for a bead, or when none was taken.
+    /// Outline of the cell, px; empty for a bead or without a cell.
     pub outline_px: &'a [(f64, f64)],
-    /// Where it was expected, px.
+    /// Its expected position, px.
     pub expected_px: (f64, f64),
-    /// Standard deviation of that place, px; infinite while it is looked for everywhere.
+    /// Standard deviation of that position, px; infinite while vision searches everywhere.
     pub expected_sd_px: f64,
     /// From pixels to the channel.
     pub scale: PictureScale,
@@ -169,7 +169,7 @@ pub struct SeenFrame<'a> {
 pub struct PictureScale {
     /// Position along the channel at the centre of the first pixel, um.
     pub first_um: f64,
-    /// Change of position with each pixel along the channel's axis, um; negative where the channel runs against it.
+    /// Change of position per pixel along the channel's axis, um; negative if the channel runs against it.
     pub um_per_px: f64,
     /// Whether the channel follows the columns of the picture rather than its rows.
     pub upright: bool,
@@ -178,7 +178,7 @@ pub struct PictureScale {
 /// Sees each new frame without delaying the loop: a live picture, a ring of the last seconds. Called on the camera's thread between
 /// a frame and its position: it must not wait, lock or allocate.
 pub trait FrameWatch: Send {
-    /// A new frame has been looked at.
+    /// Called after vision has processed a new frame.
     fn frame(&mut self, seen: &SeenFrame<'_>);
 }
 
@@ -190,7 +190,7 @@ pub trait PositionSource: Send {
     /// [`CameraError`] when there will be no more.
     fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError>;
 
-    /// Where the bead truly is now, um, where anything knows (emulated rig only, else NaN): for moments without a position.
+    /// True bead position now, um (emulated rig only, else NaN), for moments without a position.
     fn truth_um(&mut self) -> f64 {
         f64::NAN
     }
@@ -198,7 +198,7 @@ pub trait PositionSource: Send {
     /// Description of the source.
     fn info(&self) -> SourceInfo;
 
-    /// Shows each new frame to `watch` from now on; `false` where the source has no frames.
+    /// Shows each new frame to `watch` from now on; `false` if the source has no frames.
     fn watch(&mut self, watch: Box<dyn FrameWatch>) -> bool {
         drop(watch);
         false

@@ -1,8 +1,8 @@
-//! What can be wrong with a table, said so that it can be put right.
+//! Errors of a table, with what is needed to correct them.
 
 use std::path::PathBuf;
 
-/// A table that could not be read or written: where, and what is wrong.
+/// A table that could not be read or written: position and problem.
 #[derive(Debug, thiserror::Error)]
 #[error("{}{}: {problem}", path.display(), line.map(|line| format!(":{line}")).unwrap_or_default())]
 pub struct TableError {
@@ -14,7 +14,7 @@ pub struct TableError {
     pub problem: TableProblem,
 }
 
-/// What is wrong with a table.
+/// The problem of a table.
 #[derive(Debug, thiserror::Error)]
 pub enum TableProblem {
     /// The file could not be read.
@@ -26,19 +26,19 @@ pub enum TableProblem {
     /// Not text in UTF-8.
     #[error("is not text (UTF-8); a record is a CSV file with the columns time_s,pzt_um,bead_um")]
     NotText,
-    /// More text than can be taken apart.
+    /// More text than can be parsed.
     #[error("is larger than 4 GB; cut it into parts, or give the run's folder")]
     TooLarge,
     /// No rows at all.
     #[error("has no rows")]
     Empty,
-    /// Numbers where the names of the columns should be: a text without a header, or an array.
+    /// Numbers instead of column names: a text without a header, or an array.
     #[error(
         "its columns have no names (it begins with numbers): say which column is which by its number from 1, and the sampling \
          rate; or, in a text file, write `time_s,pzt_um,bead_um` above them"
     )]
     NoHeader,
-    /// A column is not there.
+    /// A column is missing.
     #[error("has no column `{wanted}`; it has {}{}", list(found), hint.as_ref().map(|hint| format!("; {hint}")).unwrap_or_default())]
     MissingColumn {
         /// The column asked for.
@@ -48,7 +48,7 @@ pub enum TableProblem {
         /// What was probably meant.
         hint: Option<String>,
     },
-    /// A column is there in another unit.
+    /// The column exists in another unit.
     #[error(
         "column `{column}` is in {unit}, but `{wanted}` is needed: convert it{}, or map the column with its factor",
         factor.map(|factor| format!(" (multiply by {factor}) and rename it `{wanted}`")).unwrap_or_default()
@@ -60,7 +60,7 @@ pub enum TableProblem {
         unit: &'static str,
         /// The column needed.
         wanted: String,
-        /// Factor from the one to the other, where there is a fixed one.
+        /// Factor from the one to the other, if it is fixed.
         factor: Option<f64>,
     },
     /// Two columns have the same name.
@@ -84,7 +84,7 @@ pub enum TableProblem {
         /// What would be right.
         help: &'static str,
     },
-    /// Time stands still or runs backwards.
+    /// Time does not advance or runs backwards.
     #[error("time goes from {before_s} s to {time_s} s; it must grow from row to row")]
     TimeOrder {
         /// Time of the row before.
@@ -103,7 +103,7 @@ pub enum TableProblem {
         /// The usual step.
         expected_s: f64,
     },
-    /// More rows are missing than are there.
+    /// More rows are missing than present.
     #[error("{missing} rows are missing and only {present} present: this is not one record")]
     TooManyGaps {
         /// Rows missing.
@@ -117,7 +117,7 @@ pub enum TableProblem {
         /// Rows present.
         rows: usize,
     },
-    /// A setting of the mapping makes no sense.
+    /// A setting of the mapping is invalid.
     #[error("`{key}` = {value}: {help}")]
     Setting {
         /// The setting.

@@ -1,8 +1,9 @@
-//! Fields of a CSV file on the way out.
+//! Fields of a CSV file for writing.
 
 use std::borrow::Cow;
 
-/// A text as a field of a CSV file: in quotes, its own doubled, where it holds anything that separates, or blanks at an end.
+/// A text as a field of a CSV file. If it contains a separator, or begins or ends with a blank, it is quoted and its own quotes
+/// are doubled.
 ///
 /// ```
 /// use cellpos_table::csv_field;

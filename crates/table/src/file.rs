@@ -5,8 +5,9 @@ use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-/// Writes a whole file so that no reader and no crash sees a partial one: into a temporary file in the same folder, synced to the
-/// disk, then renamed over `path`. Folders are made as needed. A device or a pipe of this name is written to, and stays.
+/// Writes a whole file so that no reader and no crash leaves a partial one. It writes a temporary file in the same folder, syncs
+/// it to the disk and renames it to `path`. It makes folders as needed. A device or a pipe of this name gets the bytes and is not
+/// replaced.
 ///
 /// # Errors
 /// [`TableProblem::Write`] with the file's name; the temporary file is removed.
@@ -15,7 +16,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), TableError> {
 }
 
 /// As [`write_atomically`], without waiting for the disk: no reader sees a partial file, but after a system crash the file may be
-/// cut off. For what can be had again.
+/// cut off. For data that can be made again.
 ///
 /// # Errors
 /// As [`write_atomically`].
@@ -42,7 +43,8 @@ fn replace(
         name.push(path.file_name().unwrap_or_default());
         name.push(format!(".{}.part", std::process::id()));
         let part = path.with_file_name(name);
-        // A new file: a symbolic link of this name would lead elsewhere. One left by a process of this number that died goes.
+        // Make a new file: a symbolic link of this name would lead elsewhere. Remove a file left by a dead process with this
+        // number.
         let _ = std::fs::remove_file(&part);
         let created = std::fs::OpenOptions::new()
             .write(true)
@@ -68,19 +70,19 @@ fn replace(
 /// More than any record of a day has, bytes.
 pub const MOST_OF_A_RECORD: u64 = 32 << 30;
 
-/// Reads a text file that a person or a program has written, and nothing else, as [`read_bytes`] does.
+/// Reads a text file that a person or a program has written, with the limits of [`read_bytes`].
 ///
 /// # Errors
-/// Those of [`read_bytes`]; [`io::ErrorKind::InvalidData`] for what is no text.
+/// Those of [`read_bytes`]; [`io::ErrorKind::InvalidData`] if it is not text.
 pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
     String::from_utf8(read_bytes(path, most)?)
         .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is not text in UTF-8"))
 }
 
-/// Reads a file: a device that never ends is refused, and so is more than `most` bytes. A pipe is read up to its end.
+/// Reads a file, or a pipe up to its end. It refuses an endless device and more than `most` bytes.
 ///
 /// # Errors
-/// [`io::Error`] with a sentence for what is no such file; [`io::ErrorKind::NotFound`] and the like as they come.
+/// [`io::Error`] with a sentence if it is not such a file; other errors, such as [`io::ErrorKind::NotFound`], unchanged.
 pub fn read_bytes(path: &Path, most: u64) -> io::Result<Vec<u8>> {
     let file = File::open(path)?;
     let meta = file.metadata()?;

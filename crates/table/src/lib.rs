@@ -1,13 +1,13 @@
 //! Records of PZT command and bead position as CSV, checked on the way in.
 //!
-//! A [`Record`] is what identification and reconciliation work on: a sampling step, the commanded PZT displacement and
-//! the bead position. Its file has the columns `time_s,pzt_um,bead_um` (more columns are allowed). Row k holds the
-//! displacement commanded from `time_s` on, held until the next row, and the position just **before** that command
-//! takes effect. An empty `bead_um` is a frame without a bead.
+//! Identification and reconciliation work on a [`Record`]: a sampling step, the commanded PZT displacement and the bead
+//! position. Its file has the columns `time_s,pzt_um,bead_um` (more columns are allowed). Row k holds the displacement
+//! commanded from `time_s` on, held until the next row, and the position just **before** that command takes effect. An
+//! empty `bead_um` is a frame without a bead.
 //!
-//! Reading refuses what would silently become a wrong result: columns in another unit, values that are not finite,
-//! time that does not grow, irregular sampling. Every refusal names file, line and column, and what would be right.
-//! Foreign data (no header, other names, volts) are read through a [`Mapping`].
+//! Reading refuses data that would silently give a wrong result: columns in another unit, values that are not finite,
+//! time that does not grow, irregular sampling. Every refusal names file, line and column, and what would be right. A
+//! [`Mapping`] reads foreign data (no header, other names, volts).
 //!
 //! This crate holds no run folder and no Arrow or Parquet (see `cellpos-record`), so that crates that only read
 //! numbers stay light.

@@ -1,4 +1,4 @@
-//! Which column is which, for records that others have written.
+//! The meaning of the columns in foreign records.
 
 /// A column by its name, or by its place counted from 1 (for files without a header).
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,7 +28,7 @@ impl From<&str> for ColumnRef {
     }
 }
 
-/// How to treat missing rows of an otherwise even record.
+/// Treatment of missing rows in an otherwise even record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Gaps {
     /// Refuse the record.
@@ -38,7 +38,7 @@ pub enum Gaps {
     Hold,
 }
 
-/// How a table becomes a [`crate::Record`]. The default reads the project's own format.
+/// The conversion of a table to a [`crate::Record`]. The default reads the project's own format.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mapping {
     /// Column of time in seconds. Not used when [`Mapping::rate_hz`] is set.
@@ -96,7 +96,7 @@ impl Mapping {
         }
     }
 
-    /// Whether the table must have a header: some column is asked for by name.
+    /// Whether the table must have a header: some column is given by name.
     pub(crate) fn by_name(&self) -> bool {
         let name = |column: &ColumnRef| matches!(column, ColumnRef::Name(_));
         name(&self.pzt)

@@ -14,7 +14,7 @@ use std::path::Path;
 /// before that command takes effect. So the model is strictly proper: y_k = C x_k + D u_(k-1).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
-    /// Where the record came from: the file's name, for reports.
+    /// Source of the record for reports: the file's name.
     pub name: String,
     /// Time of the first row, s.
     pub start_s: f64,
@@ -22,7 +22,7 @@ pub struct Record {
     pub step_s: f64,
     /// Commanded PZT displacement, um; always finite.
     pub pzt_um: Vec<f64>,
-    /// Bead position, um; NaN where no bead was seen. Same length as `pzt_um`.
+    /// Bead position, um; NaN in rows without a bead. Same length as `pzt_um`.
     pub bead_um: Vec<f64>,
     /// Further columns that hold numbers, in the file's order, with their names; NaN for empty fields.
     pub more: Vec<(String, Vec<f64>)>,
@@ -33,7 +33,7 @@ pub struct Record {
 }
 
 impl Record {
-    /// A record made by a program. `bead_um` is cut or filled with NaN to the length of `pzt_um`.
+    /// A record from a program's data. `bead_um` is cut or filled with NaN to the length of `pzt_um`.
     pub fn new(name: &str, step_s: f64, pzt_um: Vec<f64>, mut bead_um: Vec<f64>) -> Self {
         bead_um.resize(pzt_um.len(), f64::NAN);
         Self {

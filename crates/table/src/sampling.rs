@@ -14,7 +14,7 @@ pub(crate) struct Grid {
 
 /// Lays times on an even grid; `tolerance` is the largest relative deviation of a step.
 ///
-/// The error comes with the row at which it stands.
+/// The error comes with its row.
 pub(crate) fn grid(
     time_s: &[f64],
     tolerance: f64,

@@ -4,9 +4,9 @@ use crate::error::{TableError, TableProblem};
 use crate::mapping::ColumnRef;
 use std::path::{Path, PathBuf};
 
-/// A text file of rows and columns: separated by semicolons, tabs, commas or white space, with or without a header.
-/// Blank lines, lines that start with `#` or `%`, and a line of units below the header are skipped. A byte-order mark and Windows
-/// line ends are accepted. Where commas do not separate, a number may have a decimal comma.
+/// A text file of rows and columns: separated by semicolons, tabs, commas or white space, with or without a header. Blank lines,
+/// lines that start with `#` or `%`, and a line of units below the header are skipped. A byte-order mark and Windows line ends
+/// are accepted. If commas do not separate, a number may have a decimal comma.
 #[derive(Debug, Clone)]
 pub struct Table<'a> {
     path: PathBuf,
@@ -94,21 +94,21 @@ fn number(field: &str) -> Option<f64> {
     field.replace(',', ".").parse().ok()
 }
 
-/// Ways in which programs write that there is no value.
+/// Notations of programs for a missing value.
 fn is_no_value(field: &str) -> bool {
     ["", "nan", "na", "n/a", "null", "none", "-"]
         .iter()
         .any(|word| field.eq_ignore_ascii_case(word))
 }
 
-/// A column's name as people say it: without the unit in brackets, in small letters.
+/// A column's plain name: without the unit in brackets, in small letters.
 fn said(name: &str) -> String {
     let plain = name.split(['[', '(']).next().unwrap_or(name);
     plain.trim().to_lowercase()
 }
 
 impl<'a> Table<'a> {
-    /// Takes a text apart. `path` is only for messages.
+    /// Parses a text. `path` is only for messages.
     ///
     /// A first line without any number is the header.
     ///
@@ -223,8 +223,8 @@ impl<'a> Table<'a> {
             })
     }
 
-    /// Place of a column, counted from 0, if it exists. Where no name is the one asked for, the only one that is it with a
-    /// unit in brackets behind it is taken.
+    /// Place of a column, counted from 0, if it exists. If no name matches, it takes the only one that matches before a unit in
+    /// brackets.
     pub fn find(&self, column: &ColumnRef) -> Option<usize> {
         match column {
             ColumnRef::Name(name) => {
@@ -255,7 +255,7 @@ impl<'a> Table<'a> {
         self.column(column, help, |field| field.is_empty() && allow_empty)
     }
 
-    /// A column of a file that others have written: what is empty, `nan`, `NA`, `null` or `-` becomes NaN.
+    /// A column of a foreign file: an empty field, `nan`, `NA`, `null` or `-` becomes NaN.
     ///
     /// # Errors
     /// As [`Table::numbers`].
@@ -298,7 +298,7 @@ impl<'a> Table<'a> {
         }
     }
 
-    /// Why a column is not there: no header, another unit, another spelling, or not at all.
+    /// The reason why a column is missing: no header, another unit, another spelling, or no such column.
     fn missing(&self, column: &ColumnRef) -> TableError {
         let ColumnRef::Name(wanted) = column else {
             return self.fail(

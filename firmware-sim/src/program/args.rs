@@ -1,4 +1,4 @@
-//! Command line of `firmware-sim`, and the configuration it leads to.
+//! Command line of `firmware-sim`, and the resulting configuration.
 
 use super::ProgramError;
 use cellpos_emulator::BoardConfig;
@@ -133,7 +133,7 @@ Example: a rig whose camera loses 1 % of its frames and whose bead is gone for h
 and in another terminal a rig.toml that names `pzt` and `camera.sock`:
   cellpos track --rig rig.toml --target 0um";
 
-/// From when on, and for how long.
+/// Start and duration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Span {
     /// Start.
@@ -258,10 +258,10 @@ struct RigFile {
 }
 
 impl Args {
-    /// Reads the files named and lets the command line have the last word.
+    /// Reads the named files; the command line overrides them.
     ///
     /// # Errors
-    /// Files that cannot be read or do not read.
+    /// Files that cannot be read or parsed.
     pub(crate) fn setup(&self) -> Result<Setup, ProgramError> {
         let mut file = match &self.rig {
             Some(path) => read_rig_file(path)?,
@@ -274,7 +274,7 @@ impl Args {
         if let Some(model) = &self.model {
             file.emulator.model.clone_from(model);
         } else if let Some(beside) = self.rig.as_deref().and_then(Path::parent) {
-            // A path in the rig file is meant from where the rig file is.
+            // A path in the rig file starts at the rig file's folder.
             let path = beside.join(&file.emulator.model);
             if path.is_file() {
                 file.emulator.model = path.display().to_string();

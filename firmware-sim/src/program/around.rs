@@ -1,4 +1,4 @@
-//! Plant and camera around a board that runs elsewhere: its converter's codes come in over a terminal.
+//! Plant and camera around a board that runs elsewhere and sends its converter's codes over a terminal.
 //!
 //! A code is three bytes, `1000 0Lcc`, `0ccc cccc`, `0ccc cccc` (L: LED, c: code, highest bit first). Only the first byte has its
 //! highest bit set, so a torn code is dropped and the next one read.
@@ -57,10 +57,10 @@ pub(super) struct Around {
 }
 
 impl Around {
-    /// Opens the terminal; until the first code the converter is taken to show the power-up displacement.
+    /// Opens the terminal. Until the first code it assumes the power-up displacement.
     ///
     /// # Errors
-    /// A terminal that cannot be opened; a world or a board that cannot be.
+    /// A terminal that cannot be opened; an invalid world or board.
     pub(super) fn open(path: &Path, setup: &Setup, start_ns: i64) -> Result<Self, ProgramError> {
         let fail = |error: Errno| ProgramError::File {
             path: path.to_owned(),

@@ -4,7 +4,7 @@ use cellpos_emulator::BoxError;
 use std::io;
 use std::path::PathBuf;
 
-/// Why the box does not run.
+/// The reason why the box does not run.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ProgramError {
     /// A file that cannot be used.
@@ -17,7 +17,7 @@ pub(crate) enum ProgramError {
         /// Error of the operating system.
         source: io::Error,
     },
-    /// A rig file that does not read.
+    /// A rig file that cannot be parsed.
     #[error("{path}: {problem}")]
     RigFile {
         /// Which.
@@ -25,7 +25,7 @@ pub(crate) enum ProgramError {
         /// What is wrong, with line and column.
         problem: String,
     },
-    /// A model that does not read.
+    /// A model that cannot be parsed.
     #[error("{0}")]
     Model(String),
     /// Values that cannot be.
@@ -42,7 +42,7 @@ pub(crate) enum ProgramError {
 }
 
 impl ProgramError {
-    /// 2 for input that is wrong, 1 for everything else.
+    /// 2 for wrong input, 1 for everything else.
     pub(crate) fn exit_code(&self) -> u8 {
         match self {
             Self::RigFile { .. } | Self::Model(_) | Self::Box(_) => 2,

@@ -7,7 +7,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 
-/// One that listens, and the rest of a frame it has not yet taken.
+/// A client, and the rest of a frame that it has not accepted yet.
 #[derive(Debug)]
 struct Client {
     stream: UnixStream,
@@ -15,7 +15,7 @@ struct Client {
     sent: usize,
 }
 
-/// Hands frames to whoever listens, without ever waiting for anybody.
+/// Sends frames to all clients without ever waiting for one.
 #[derive(Debug)]
 pub(super) struct FrameServer {
     listener: UnixListener,
@@ -55,7 +55,7 @@ impl FrameServer {
         &self.path
     }
 
-    /// Lets new clients in; whether there are any clients.
+    /// Accepts new clients; returns whether there are any clients.
     pub(super) fn accept(&mut self) -> bool {
         while let Ok((stream, _)) = self.listener.accept() {
             if stream.set_nonblocking(true).is_ok() {
@@ -69,7 +69,7 @@ impl FrameServer {
         !self.clients.is_empty()
     }
 
-    /// Hands a frame to every client that has taken the one before; drops clients that have gone.
+    /// Sends a frame to every client that has accepted the one before; drops clients that have gone.
     pub(super) fn send(&mut self, header: &FrameHeader, pixels: &[u8]) {
         let skipped = &mut self.skipped;
         self.clients.retain_mut(|client| {
@@ -90,7 +90,7 @@ impl FrameServer {
 }
 
 impl Client {
-    /// Sends what waits, as far as the socket takes it; `false` when the client is gone.
+    /// Sends the waiting bytes as far as the socket accepts them; `false` if the client is gone.
     fn push(&mut self) -> bool {
         while let Some(rest) = self
             .waiting

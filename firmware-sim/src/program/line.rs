@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug)]
 pub(super) struct Line {
     board_end: OwnedFd,
-    /// Held open, so that a host that goes away leaves the line as it is.
+    /// Held open, so that the line does not change when a host goes away.
     host_end: OwnedFd,
     path: PathBuf,
     link: Option<PathBuf>,
@@ -90,7 +90,7 @@ impl Line {
         }
     }
 
-    /// Writes to the host. When nobody reads, what has piled up is thrown away: the next host is to hear news.
+    /// Writes to the host. If nobody reads, it discards the old bytes, so that the next host gets new ones.
     ///
     /// # Errors
     /// What the operating system refuses.
@@ -106,7 +106,7 @@ impl Line {
         }
     }
 
-    /// Has the line take nothing from the host, or take it again, as a USB line whose device does not answer.
+    /// Stops or resumes input from the host, like a USB line whose device does not answer.
     ///
     /// # Errors
     /// What the operating system refuses.

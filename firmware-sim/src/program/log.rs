@@ -1,4 +1,4 @@
-//! The box's own log: the truth, for proofs that do not rely on the host's word.
+//! The box's own log of the truth, for tests that do not rely on the host.
 
 use super::ProgramError;
 use std::fs::File;
@@ -75,7 +75,7 @@ impl Log {
     /// Writes a row when one is due.
     ///
     /// # Errors
-    /// What the operating system refuses, a full disk for example.
+    /// A refusal of the operating system, for example a full disk.
     pub(super) fn note(&mut self, instant: &Instant<'_>) -> Result<(), ProgramError> {
         let now_ns = instant.now_ns;
         let changed = instant.state != self.last_state;
@@ -106,7 +106,7 @@ impl Log {
         Ok(())
     }
 
-    /// Hands everything to the operating system.
+    /// Passes everything to the operating system.
     ///
     /// # Errors
     /// What the operating system refuses.

@@ -1,4 +1,4 @@
-//! Waiting on the monotonic clock, and handing over what is due by then.
+//! Waits on the monotonic clock, and delivers the frames that are due.
 
 use super::error::ProgramError;
 use super::frame_server::FrameServer;
@@ -9,9 +9,9 @@ use rustix::io::Errno;
 use rustix::time::{ClockId, clock_gettime};
 use std::os::fd::BorrowedFd;
 
-/// Without anything to do the box still wakes up this often: exposures are not announced.
+/// Interval of wake-ups without work: exposures are not announced.
 pub(super) const LONGEST_SLEEP_NS: i64 = 500_000;
-/// How often the line is unlocked and new clients are let in.
+/// Interval of unlocking the line and accepting new clients.
 pub(super) const HOUSEKEEPING_NS: i64 = 20_000_000;
 
 /// Now on the monotonic clock, ns.
@@ -20,7 +20,7 @@ pub(super) fn monotonic_ns() -> i64 {
     now.tv_sec * 1_000_000_000 + now.tv_nsec
 }
 
-/// Hands the frames that have been delivered by now to the clients; returns how many.
+/// Sends the frames delivered by now to the clients; returns their number.
 pub(super) fn send_frames(
     world: &mut World,
     server: &mut FrameServer,

@@ -18,7 +18,7 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id,
 };
 
-/// Above the host's threads: a camera and a board do not wait for a busy host either.
+/// Above the priority of the host's threads: a real camera and board do not wait for a busy host either.
 const PRIORITY: u8 = 60;
 
 /// Runs the box until the duration is over or a signal comes.
@@ -101,7 +101,7 @@ pub(crate) fn run(args: &Args) -> Result<(), ProgramError> {
     Ok(())
 }
 
-/// Says where the box can be found.
+/// Prints the paths of the box.
 fn announce(board: &Path, link: Option<&Path>, server: &FrameServer) -> Result<(), ProgramError> {
     let mut out = std::io::stdout().lock();
     let mut say = || -> std::io::Result<()> {
@@ -169,7 +169,7 @@ fn pace(
             rig.advance_to(now_ns);
         }
         loop {
-            // A packet a time; without packets, all that there is.
+            // One packet per turn; without packets, everything.
             let count = rig.transmit(buffer.get_mut(..room).unwrap_or(&mut []));
             if count == 0 {
                 break;
@@ -202,7 +202,7 @@ fn pace(
         if stop.load(Ordering::Relaxed) || now_ns >= end_ns {
             return Ok(frames);
         }
-        // A line that is stalled, or between two packets, is not looked at before its time.
+        // Do not look at a line before its time if it is stalled or between two packets.
         let event_ns = rig.next_event_ns().min(usb.next_event_ns(now_ns));
         let readiness = (room > 0).then(|| line.readiness());
         wait(readiness, event_ns.min(now_ns + LONGEST_SLEEP_NS))?;

@@ -1,4 +1,4 @@
-//! The line as USB makes it: moments in which it takes nothing, and bytes in packets.
+//! A line with the behaviour of USB: moments in which it accepts nothing, and bytes in packets.
 
 use super::args::StallOption;
 use cellpos_numeric::Random;
@@ -6,10 +6,10 @@ use cellpos_numeric::Random;
 /// A microframe of high-speed USB, ns: a packet each way.
 const MICROFRAME_NS: i64 = 125_000;
 
-/// When the line stalls, and how many bytes pass at a time.
+/// The stalls of the line, and the size of its packets.
 #[derive(Debug)]
 pub(super) struct Usb {
-    /// Start and end of the stalls asked for, ns of the machine's clock.
+    /// Start and end of the requested stalls, ns of the machine's clock.
     spans_ns: Vec<[i64; 2]>,
     random: Vec<RandomStalls>,
     chunk: Option<usize>,
@@ -74,7 +74,7 @@ impl Usb {
         this
     }
 
-    /// Whether the line takes and gives nothing at present.
+    /// Whether the line is stalled at present.
     pub(super) fn is_stalled(&mut self, now_ns: i64) -> bool {
         let within = |[from_ns, until_ns]: &[i64; 2]| (*from_ns..*until_ns).contains(&now_ns);
         let mut stalled = self.spans_ns.iter().any(within);
@@ -99,7 +99,7 @@ impl Usb {
         chunk.min(most)
     }
 
-    /// When something of the line happens next, ns: the box must look then.
+    /// Time of the line's next event, ns, at which the box must look.
     pub(super) fn next_event_ns(&self, now_ns: i64) -> i64 {
         let packet_ns = match self.chunk {
             Some(_) => self.next_packet_ns.max(now_ns),

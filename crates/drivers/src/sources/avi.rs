@@ -1,5 +1,5 @@
-//! AVI films: uncompressed grey (`Y800`, `GREY`, `Y8`, `Y16`), bitmaps of 8 bits (with a grey palette) or 24, and MJPEG.
-//! Other codecs are refused with the one command that converts them.
+//! AVI films: uncompressed grey (`Y800`, `GREY`, `Y8`, `Y16`), bitmaps of 8 bits (with a grey palette) or 24, and MJPEG. Other
+//! codecs are refused; the error gives the command that converts them.
 
 use super::grey::{self, Grey};
 use super::jpeg;
@@ -11,7 +11,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// How the frames are stored.
+/// Storage of the frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Codec {
     /// Rows of grey pixels from the top, of 8 or 16 bits.
@@ -58,7 +58,7 @@ impl AviFilm {
     /// Opens a film, lists its frames and decodes the first.
     ///
     /// # Errors
-    /// No AVI, no video stream, a codec that is not read, or a damaged first frame.
+    /// The file is not an AVI or has no video stream, its codec is not supported, or its first frame is damaged.
     pub fn open(path: &Path) -> Result<Self, SourceError> {
         let unreadable = |cause| SourceError::Unreadable {
             path: path.to_path_buf(),

@@ -1,4 +1,4 @@
-//! Grey values out of pictures that were saved in colour: channels that are all the same are one.
+//! Grey values from pictures saved in colour: equal channels are merged into one.
 
 use super::SourceError;
 use cellpos_rig::source::FrameBuffer;
@@ -11,7 +11,7 @@ pub(crate) enum Grey<'a> {
     Sixteen(&'a [u16]),
 }
 
-/// What is said once of a recording whose channels were equal.
+/// The note on a recording with equal channels, given once.
 const EQUAL: &str = "three equal channels of colour, read as one of grey";
 
 pub(crate) fn refuse(path: &Path, frame: usize, found: String) -> SourceError {

@@ -1,8 +1,8 @@
 //! Industrial cameras (GigE Vision and USB3 Vision) through Aravis.
 //!
-//! Built only with the feature `aravis`, which needs the system libraries libaravis and libusb. GigE cameras are
-//! addressed by their IP address: searching the network by name takes seconds and finds the wrong one of two. Aravis'
-//! packet socket, which it takes when run as root, hands frames over in bursts of five: it is turned off here.
+//! Built only with the feature `aravis`, which needs the system libraries libaravis and libusb. GigE cameras are addressed by
+//! their IP address: a search of the network by name takes seconds, and may find the wrong one of two. As root, Aravis would use
+//! its packet socket, which delivers frames in bursts of five; this module turns it off.
 
 use super::Region;
 use aravis::prelude::*;
@@ -12,25 +12,25 @@ use cellpos_rig::freshness::{FrameAccount, FrameCounts, IdKind};
 use cellpos_rig::source::{Camera, CameraError, FrameBuffer, FrameStamp, SourceInfo};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-/// Without a frame for this long the camera is asked whether it is still there.
+/// Time without a frame after which the driver checks that the camera still answers.
 const SILENCE: Duration = Duration::from_millis(1000);
 /// Frames older than this on arrival are stale, ns.
 const MAX_AGE_NS: i64 = 1_000_000_000;
-/// After a step of the calendar clock frames stamped before it may still be in the queue for this long, ns.
+/// After a step of the calendar clock, frames stamped before it may be in the queue for this time, ns.
 const STEP_FORGOTTEN_NS: i64 = 1_000_000_000;
-/// The least rate at which the estimate of the offset between the clocks may rise: cameras' clocks are off by less.
+/// Rate at which the estimate of the clocks' offset may rise: cameras' clocks are off by less.
 const CLOCK_SKEW: f64 = 200e-6;
 
-/// How a camera is to be run.
+/// Settings of a camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IndustrialSettings {
     /// IP address of a GigE camera, or the identifier of a USB3 camera.
     pub address: String,
-    /// Part of the sensor read out; left out: as the camera is set.
+    /// Part of the sensor that is read out; left out: the camera's own setting.
     pub region: Option<Region>,
     /// Frame rate, Hz.
     pub rate_hz: f64,
-    /// Exposure, us; left out: as the camera is set.
+    /// Exposure, us; left out: the camera's own setting.
     pub exposure_us: Option<f64>,
     /// 8 or 16 bits per pixel.
     pub bits: u16,
@@ -227,7 +227,7 @@ impl IndustrialCamera {
         }
     }
 
-    /// Copies a frame and stamps it; `None` when it is no new, whole picture.
+    /// Copies a frame and stamps it; `None` if it is not a new, complete picture.
     fn take(&mut self, packet: &aravis::Buffer, buffer: &mut FrameBuffer) -> Option<FrameStamp> {
         if packet.status() != BufferStatus::Success {
             self.incomplete += 1;
@@ -284,8 +284,8 @@ impl IndustrialCamera {
         })
     }
 
-    /// Offset from the camera's clock to this machine's: the smallest seen, for delays only add, let rise slowly so that
-    /// it follows a camera whose clock runs slow.
+    /// Offset from the camera's clock to this machine's: the smallest seen, because delays only add. It rises slowly, to follow a
+    /// camera whose clock runs slow.
     fn clock_offset(&mut self, arrival_ns: i64, camera_ns: f64) -> f64 {
         let now = arrival_ns as f64 - camera_ns;
         let offset = match self.offset {
@@ -357,7 +357,7 @@ fn account(kind: IdKind, rate_hz: f64) -> FrameAccount {
     FrameAccount::new(kind, (1e9 / rate_hz) as i64, MAX_AGE_NS)
 }
 
-/// Turns calendar stamps into spans of time, and does not let a step of the calendar clock become one.
+/// Turns calendar stamps into time spans, without the steps of the calendar clock.
 #[derive(Debug, Clone, Copy)]
 struct Calendar {
     /// Calendar less monotonic clock, ns.
@@ -381,7 +381,7 @@ impl Calendar {
         }
     }
 
-    /// How long ago, ns, a calendar stamp was made; 0 while a step of the calendar clock makes that unknown.
+    /// Age of a calendar stamp, ns; 0 while a step of the calendar clock makes it unknown.
     fn since_ns(&mut self, stamp_ns: u64, now_ns: i64) -> i64 {
         /// The clock is slewed by less than this between two frames, ns.
         const STEP_NS: u64 = 1_000_000;
@@ -425,7 +425,7 @@ impl Camera for IndustrialCamera {
         }
         let silent_ns = monotonic_ns() - self.last_frame_ns;
         if silent_ns > SILENCE.as_nanos() as i64 {
-            // A stall is no error; a camera that does not answer is.
+            // A stall is not an error; a camera that does not answer is.
             if let Err(error) = self.camera.frame_rate() {
                 return Err(CameraError::Gone {
                     camera: self.settings.address.clone(),

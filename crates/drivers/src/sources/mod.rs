@@ -31,10 +31,10 @@ pub use playback::Playback;
 pub use region::Region;
 pub use tiff::TiffStack;
 
-/// Largest picture taken, pixels: a header that claims more is broken.
+/// Largest accepted picture, pixels: a header that claims more is damaged.
 pub const MAX_PIXELS: usize = 1 << 26;
 
-/// Why a recording, or a frame of it, cannot be read.
+/// The reason why a recording or one of its frames cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
     /// The file or folder cannot be opened or read.
@@ -54,7 +54,7 @@ pub enum SourceError {
         /// Which file.
         path: PathBuf,
     },
-    /// A film in a format that is not read here.
+    /// A film in an unsupported format.
     #[error("{}: {format} is not read here: convert it without loss with `{command}` and give that film", path.display())]
     Film {
         /// Which file.
@@ -69,7 +69,7 @@ pub enum SourceError {
     Empty {
         /// Which file.
         path: PathBuf,
-        /// What should have been there.
+        /// The expected content.
         expected: &'static str,
     },
     /// The file ends, or its data break off, before the frame is whole.
@@ -102,7 +102,7 @@ pub enum SourceError {
         /// How many of each kind.
         found: String,
     },
-    /// A compression that is not read here.
+    /// An unsupported compression.
     #[error(
         "{}: frame {frame} is compressed by {name} (method {method}): save it uncompressed, or with LZW, Deflate or PackBits",
         path.display()
@@ -117,7 +117,7 @@ pub enum SourceError {
         /// Its name.
         name: &'static str,
     },
-    /// A frame without pixels, or of more than can be.
+    /// A frame with no pixels or with too many.
     #[error("{}: frames of {width} x {height} px: from 1 x 1 to 2^26 pixels are possible", path.display())]
     Size {
         /// Which file.
@@ -174,7 +174,7 @@ pub enum SourceError {
         width: usize,
         /// Height of the frame, px.
         height: usize,
-        /// What is wrong with it.
+        /// The error of the region.
         problem: &'static str,
     },
 }
@@ -196,11 +196,11 @@ pub struct RecordingInfo {
     pub frames: usize,
     /// Frames between them that are missing.
     pub lost: u64,
-    /// Frame rate, when the recording says so, Hz.
+    /// Frame rate, if the recording states it, Hz.
     pub rate_hz: Option<f64>,
-    /// Size of a pixel, when the recording says so, um.
+    /// Size of a pixel, if the recording states it, um.
     pub pixel_um: Option<f64>,
-    /// What is to be said of how it was read.
+    /// Notes on the reading of the recording.
     pub note: Option<&'static str>,
 }
 
@@ -214,7 +214,7 @@ pub trait Recording: Send + std::fmt::Debug {
         index as u64
     }
 
-    /// The empty scene, where the recording holds it or enough frames to tell it.
+    /// The empty scene, if the recording holds it or enough frames to compute it.
     ///
     /// # Errors
     /// It is there but damaged.
@@ -268,7 +268,7 @@ pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
     }
 }
 
-/// Films that are not read, by the ends of their names.
+/// Unsupported films, by the ends of their names.
 const FILMS: [(&str, &str); 9] = [
     ("mp4", "MP4"),
     ("m4v", "MP4"),
@@ -321,7 +321,7 @@ pub(crate) fn fill(info: &RecordingInfo, bytes: &[u8], big_endian: bool, buffer:
     }
 }
 
-/// Refuses sizes that cannot be.
+/// Refuses invalid sizes.
 pub(crate) fn check_size(path: &Path, width: usize, height: usize) -> Result<(), SourceError> {
     match width.checked_mul(height) {
         Some(n) if (1..=MAX_PIXELS).contains(&n) => Ok(()),

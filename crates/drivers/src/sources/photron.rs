@@ -1,7 +1,7 @@
 //! Photron recordings: a header (`.cihx`, XML, or the older `.cih`, lines of `key : value`) with the pixels (`.mraw`).
 //!
-//! The pixels lie frame after frame without gaps: 8 bits, 16 bits little-endian, or 12 bits packed, two pixels in three
-//! bytes with the high bits first. Frames of 12 effective bits in 16 may sit at the lower or the higher side.
+//! The pixels are stored frame after frame without gaps: 8 bits, 16 bits little-endian, or 12 bits packed, two pixels
+//! in three bytes with the high bits first. Frames of 12 effective bits in 16 may sit at the lower or the higher side.
 
 use super::{Recording, RecordingInfo, SourceError, check_size};
 use cellpos_rig::source::FrameBuffer;
@@ -258,7 +258,8 @@ impl Keys<'_> {
             effective_bits,
             higher_side: (self.get)(side).is_some_and(|s| s.trim().eq_ignore_ascii_case("higher")),
         };
-        // All frames are one run of bits: with an odd number of pixels every other frame would begin inside a byte.
+        // All frames form one sequence of bits: with an odd number of pixels every other frame would begin inside a
+        // byte.
         if stored_bits == 12 && (header.width * header.height) % 2 == 1 {
             let must_be = "an even number of pixels in 12-bit packing";
             return Err(self.error(width, Some(header.width.to_string()), must_be));

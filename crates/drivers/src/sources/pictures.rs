@@ -206,8 +206,8 @@ fn decode_png(
     grey::take(path, frame, values, (channels, alpha), buffer)
 }
 
-/// Frame numbers, from 0, out of the numbers that the names end with; in steps of the smallest distance between two. Names
-/// without such numbers, or alike ones, are counted.
+/// Frame numbers, from 0, from the numbers at the end of the names, in steps of their smallest distance. Names without numbers,
+/// or with equal ones, are counted instead.
 fn frame_numbers(pictures: &[PathBuf]) -> Vec<u64> {
     let counted = || (0..pictures.len() as u64).collect();
     let Some(numbers) = pictures
@@ -230,7 +230,7 @@ fn frame_numbers(pictures: &[PathBuf]) -> Vec<u64> {
         .min()
         .unwrap_or(1);
     let whole = numbers.iter().all(|(_, n)| (n - first) % step == 0);
-    // A folder in which most is missing is no recording with gaps but a choice of pictures.
+    // If most numbers are missing, the folder is a selection of pictures, not a recording with gaps.
     let span = numbers.last().map_or(0, |(_, last)| (last - first) / step) + 1;
     if !whole || span > 4 * pictures.len() as u64 {
         return counted();

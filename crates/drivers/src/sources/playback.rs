@@ -4,8 +4,8 @@ use super::{Recording, Region, SourceError};
 use cellpos_rig::clock::Clock;
 use cellpos_rig::source::{Camera, CameraError, FrameBuffer, FrameStamp, SourceInfo};
 
-/// Plays a recording at a frame rate: frame `n` is exposed about `start + n / rate` and arrives then. Reading from disk
-/// takes its time; a frame read late arrives late, and none is left out.
+/// Plays a recording at a frame rate: frame `n` is exposed about `start + n / rate` and arrives then. A frame that the
+/// disk gives late arrives late; no frame is left out.
 #[derive(Debug)]
 pub struct Playback {
     recording: Box<dyn Recording>,
@@ -46,7 +46,7 @@ impl Playback {
     }
 }
 
-/// Frame rate of a recording that does not say, Hz.
+/// Frame rate of a recording that does not state it, Hz.
 const DEFAULT_RATE_HZ: f64 = 1000.0;
 
 impl Camera for Playback {

@@ -28,7 +28,7 @@ impl std::fmt::Display for Region {
     }
 }
 
-/// A text that is no region.
+/// A text that is not a region.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{text:?} is no region: write WIDTHxHEIGHT+X+Y in pixels, such as 64x64+200+120")]
 pub struct RegionTextError {

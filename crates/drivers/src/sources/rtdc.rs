@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 /// Most backgrounds that are averaged, and pictures of which a median is taken where the file holds none.
 const MOST_BACKGROUNDS: usize = 64;
-/// Filters that such files come with and that are not read here.
+/// Filters that occur in such files but are not supported.
 const FILTERS: [(u16, &str); 4] = [
     (307, "bzip2"),
     (32_001, "Blosc"),
@@ -177,7 +177,7 @@ impl Recording for RtdcRecording {
     }
 }
 
-/// Median of each pixel: a cell in a few of the frames is not in it.
+/// Median of each pixel, which a cell in a few frames does not change.
 fn median(frames: &[FrameBuffer]) -> Option<FrameBuffer> {
     let first = frames.first()?;
     let mut values = Vec::with_capacity(frames.len());
@@ -204,7 +204,7 @@ fn median(frames: &[FrameBuffer]) -> Option<FrameBuffer> {
     Some(picture)
 }
 
-/// Frame numbers from the first on, where there is one for each event and they grow; else none.
+/// Frame numbers from the first on, if there is one for each event and they grow; else none.
 fn growing(numbers: &[f64], events: usize) -> Vec<u64> {
     let (Some(first), true) = (numbers.first(), numbers.len() == events) else {
         return Vec::new();

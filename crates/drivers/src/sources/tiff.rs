@@ -56,7 +56,7 @@ impl TiffStack {
         info.note = decode(&mut decoder, path, 0, &mut buffer)?;
         (info.width_px, info.height_px, info.bits) = (buffer.width, buffer.height, buffer.bits);
         while decoder.more_images() && info.frames < MAX_PAGES {
-            // A page whose directory cannot be read ends the stack here; reading it will say why.
+            // A page with an unreadable directory ends the stack here; reading that page gives the error.
             let readable = decoder.next_image().is_ok();
             info.frames += 1;
             if !readable {

@@ -1,5 +1,5 @@
-//! Datasets whose chunks are compressed by Zstandard (HDF5 filter 32015), which the HDF5 reader does not decode: it gives the
-//! places of the chunks, and they are read and decoded here. Other filters: shuffle, and a checksum, which Zstandard has already.
+//! Datasets with chunks compressed by Zstandard (HDF5 filter 32015). The HDF5 reader does not decode them but gives their places;
+//! this module reads and decodes them. It supports two other filters: shuffle, and a checksum, which Zstandard has already.
 
 use hdf5_pure::{DType, Dataset, Error};
 use std::fs::File;
@@ -10,7 +10,7 @@ use std::path::Path;
 const SHUFFLE: u16 = 2;
 const CHECKSUM: u16 = 3;
 pub(crate) const ZSTANDARD: u16 = 32_015;
-/// Largest chunk taken, bytes: a header that claims more is broken.
+/// Largest accepted chunk, bytes: a header that claims more is damaged.
 const LARGEST_CHUNK: u64 = 1 << 30;
 
 /// A dataset read row by row (along its first side), whatever its chunks are compressed by.
@@ -38,7 +38,7 @@ impl Rows {
     pub(super) fn new(dataset: Dataset, path: &Path) -> Result<Self, Error> {
         let filters = dataset.filters();
         let known = |f: &u16| [SHUFFLE, CHECKSUM, ZSTANDARD].contains(f);
-        // With a filter that is unknown here, too, the reader's own error names it.
+        // If the filter is unknown here too, the reader's own error names it.
         if !filters.contains(&ZSTANDARD) || !filters.iter().all(known) {
             return Ok(Rows {
                 dataset,

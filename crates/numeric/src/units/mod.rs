@@ -27,7 +27,7 @@ pub(crate) struct Unit {
     pub(crate) factor: f64,
 }
 
-/// What the parser needs to know of a quantity.
+/// The parser's data of a quantity.
 pub(crate) struct Quantity {
     pub(crate) noun: &'static str,
     pub(crate) base: &'static str,

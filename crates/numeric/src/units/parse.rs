@@ -3,7 +3,7 @@
 use crate::units::Quantity;
 use core::fmt;
 
-/// What is wrong with a text that should have been a quantity.
+/// The error of a text that should be a quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnitProblem {
     /// Nothing was written.
@@ -18,7 +18,7 @@ pub enum UnitProblem {
     WrongUnit,
 }
 
-/// A text that is not the quantity asked for; its message says what to write instead.
+/// A text that is not the expected quantity; its message says what to write instead.
 ///
 /// Holds the first characters of the text (at most 23 bytes), so that the message can repeat the number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

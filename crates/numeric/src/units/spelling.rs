@@ -1,11 +1,11 @@
-//! Which known name a misspelt one was perhaps meant to be. Every file format of cellpos refuses unknown keys; a refusal
-//! without a suggestion costs its reader a look into the manual.
+//! Suggests a known name for a misspelt one. Every file format of cellpos refuses unknown keys; without a suggestion the user
+//! must look into the manual.
 
 /// Letters that are compared; longer names are cut.
 const MOST: usize = 40;
 
-/// The known name nearest to a misspelt one, if it is near enough to be meant: one slip, and one more for every three
-/// letters of the shorter of the two. Case does not count, nor does `-` against `_`.
+/// The known name nearest to a misspelt one, if it is near enough: one slip, and one more for every three letters of the shorter
+/// name. Case does not count, and `-` equals `_`.
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     known
         .into_iter()
@@ -17,15 +17,15 @@ pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Opti
         .map(|(_, known)| known)
 }
 
-/// The known name nearest to the unknown one in a message of serde: "unknown field `a`, expected one of `b`, `c`". `None`
-/// for any other message, and where none is near.
+/// The known name nearest to the unknown one in a message of serde: "unknown field `a`, expected one of `b`, `c`". `None` for any
+/// other message, and if no name is near.
 pub fn nearest_in(message: &str) -> Option<&str> {
     if !message.starts_with("unknown") {
         return None;
     }
     let mut quoted = message.split('`').skip(1).step_by(2);
     let wrong = quoted.next()?;
-    // The unit left out is the slip that is made most.
+    // The most frequent slip is to leave out the unit.
     let with_unit = quoted.clone().find(|known| {
         let rest = known.strip_prefix(wrong);
         rest.is_some_and(|rest| rest.starts_with('_'))
