@@ -36,7 +36,7 @@ impl CommandedFlow {
     }
 
     fn history(&self) -> MutexGuard<'_, History> {
-        // A thread that panicked while it held the lock left whole numbers behind.
+        // The data are valid even if a thread panicked while it held the lock.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

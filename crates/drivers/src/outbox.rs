@@ -42,7 +42,7 @@ impl Outbox {
         self.begun.is_none() && self.next.is_none()
     }
 
-    /// Puts a frame behind the one that was begun, in place of one that was not. A command does not replace an order.
+    /// Queues a frame after the one that was begun, and replaces one that was not begun. A command does not replace an order.
     pub(crate) fn put(&mut self, bytes: &[u8; MAX_FRAME], length: usize, kind: Kind) {
         let frame = Frame {
             bytes: *bytes,

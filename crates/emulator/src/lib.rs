@@ -6,8 +6,8 @@
 //! world also gives the true positions. Faults come from a schedule ([`Faults`]). The only clock is the time that the caller
 //! passes.
 //!
-//! [`RigInABox`] joins the world to a [`Board`] on one clock; [`EmulatedRig`] puts both behind the traits of
-//! `cellpos-rig`, on the real clock or a virtual one. A seed fixes every bit of what comes out.
+//! [`RigInABox`] joins the world to a [`Board`] on one clock; [`EmulatedRig`] puts both behind the traits of `cellpos-rig`, on
+//! the real clock or a virtual one. A seed fixes every bit of the output.
 //!
 //! ```
 //! use cellpos_emulator::{World, WorldConfig};

@@ -138,7 +138,7 @@ impl<P: Port> Port for MisbehavingLine<P> {
         } else if self.faults.part > 0.0 && self.dice.uniform() < self.faults.part {
             taken = (self.dice.uniform() * taken as f64) as usize;
         }
-        // A frame has at most 104 bytes; what is longer goes in pieces.
+        // A frame has at most 104 bytes; longer data are written in pieces.
         let mut passed = [0; 128];
         taken = taken.min(passed.len());
         let mut count = 0;

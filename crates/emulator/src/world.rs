@@ -18,7 +18,7 @@ use cellpos_vision::FixQuality;
 /// Turns a seed into that of frames of the empty channel.
 const EMPTY_SEED: u64 = 0x5eed_0f0e_3a97_7c41;
 
-/// The emulated world. Times are nanoseconds of whatever clock the caller keeps, starting at `start_ns`.
+/// The emulated world. Times are nanoseconds of the caller's clock, from `start_ns` on.
 ///
 /// ```
 /// use cellpos_emulator::{World, WorldConfig};

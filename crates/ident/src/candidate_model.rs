@@ -69,7 +69,7 @@ impl CandidateModel {
         }
     }
 
-    /// Delay less the lead of the far zero, s. For an integrator behind a zero-order hold, delay and lead trade exactly, so the phase of
+    /// Delay minus the lead of the far zero, s. For an integrator behind a zero-order hold, delay and lead trade exactly, so the phase of
     /// a record determines only this difference.
     pub fn effective_delay_s(&self) -> f64 {
         self.delay_s - self.far_lead_s

@@ -79,7 +79,7 @@ impl CandidateOrder {
 pub mod index {
     /// `ln` of the integrator gain in 1/s.
     pub const LN_GAIN: usize = 0;
-    /// Delay less the far zero's lead, ms.
+    /// Delay minus the far zero's lead, ms.
     pub const EFFECTIVE_DELAY_MS: usize = 1;
     /// `ln` of the pair's zero in rad/s.
     pub const LN_ZERO: usize = 2;
@@ -154,7 +154,7 @@ impl CandidateFits {
     }
 }
 
-/// The model that a parameter vector stands for.
+/// The model of a parameter vector.
 pub fn model_of(x: &[f64], order: CandidateOrder) -> CandidateModel {
     let mut model =
         CandidateModel::integrator(x[index::LN_GAIN].exp(), x[index::EFFECTIVE_DELAY_MS] * 1e-3);

@@ -25,7 +25,7 @@ pub enum IdentError {
         /// Rows of the output.
         output: usize,
     },
-    /// Too few usable rows for what is asked.
+    /// Too few usable rows for the request.
     #[error("{rows} usable rows are too few for {what}: record at least {needed}")]
     TooShort {
         /// What was to be estimated.
@@ -35,7 +35,7 @@ pub enum IdentError {
         /// Rows needed.
         needed: usize,
     },
-    /// The input does not move at a frequency where a response is asked for.
+    /// The input does not move at a frequency at which a response is requested.
     #[error(
         "the input holds no signal at {frequency_hz} Hz (amplitude {amplitude}): excite it there or leave it out"
     )]
@@ -81,7 +81,7 @@ pub enum IdentError {
         /// What stopped the iteration.
         reason: &'static str,
     },
-    /// The bead was lost; what was measured before is kept and the experiment can resume.
+    /// The bead was lost. Earlier measurements are kept and the experiment can resume.
     #[error(
         "the bead was lost in segment {segment} of {segments} ({frames} frames in a row without a position): bring it back and resume at that segment"
     )]

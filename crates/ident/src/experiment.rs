@@ -24,7 +24,7 @@ pub struct Row {
     pub bead_um: Option<f64>,
 }
 
-/// A rig, real or emulated, that adds an excitation to whatever holds the bead.
+/// A rig, real or emulated, that adds an excitation to the command that holds the bead.
 pub trait Bench {
     /// Errors of the rig itself.
     type Error;

@@ -16,7 +16,7 @@ use crate::tone_fit::{ToneFit, Whitening, block_borders, fit_block};
 pub struct DrivenStretch<'a> {
     /// Input (commanded displacement, um), one value per row.
     pub input: &'a [f64],
-    /// Output (bead position, um), `NaN` where a frame showed no bead.
+    /// Output (bead position, um), `NaN` if a frame showed no bead.
     pub output: &'a [f64],
     /// First row to use (after the start-up transient).
     pub from: usize,

@@ -75,8 +75,8 @@ pub fn compensated(
     measured * model.response(frequency_hz) / model.sampled_response(frequency_hz, sampling)
 }
 
-/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`. `stated_per_s` is the velocity gain believed
-/// before, for a warning if it is the measured one divided by 2 pi. `two_lags`: the plant may be a regulator with a tube behind it.
+/// Fits, judges and compensates. `bootstrap` replicates (0: none) are drawn with `seed`. `stated_per_s` is the velocity gain assumed
+/// before; there is a warning if it is the measured one divided by 2 pi. `two_lags`: the plant may be a regulator with a tube behind it.
 ///
 /// # Errors
 /// Those of [`OrderSelection::new`] and [`OrderSelection::fit`].

@@ -163,7 +163,7 @@ pub fn block_borders(
         .min(most)
         .min((rows / 24.0) as usize)
         .max(1);
-    // Whole periods per block, where that loses little of the record.
+    // Whole periods per block, if that loses little of the record.
     let per_block = (periods / blocks as f64).floor().max(1.0) * per_period;
     let length = if per_block * blocks as f64 > 0.9 * rows {
         per_block

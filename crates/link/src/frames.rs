@@ -20,8 +20,8 @@
 //! | 48 | 12 | 0 |
 //! | 60 | 4 | CRC-32 (ISO HDLC) of bytes 0..60 |
 //!
-//! A client may connect, go away and come back; it starts with the next whole frame. A client that reads too slowly
-//! loses whole frames, never parts of one. Not a camera protocol: real cameras have their own.
+//! A client may connect, disconnect and connect again; it starts with the next whole frame. A client that reads too slowly loses
+//! whole frames, never parts of one. Not a camera protocol: real cameras have their own.
 
 use crc::{CRC_32_ISO_HDLC, Crc, Table};
 

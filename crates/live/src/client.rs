@@ -18,7 +18,7 @@ const MOST_REQUESTS: u32 = 50;
 /// Longest message of a client, bytes.
 const MESSAGE_BYTES: usize = 4096;
 
-/// Serves a client until it goes, stalls, floods, or the server ends.
+/// Serves a client until it disconnects, stalls or floods, or the server ends.
 pub(crate) fn serve(stream: TcpStream, role: Role, queue: &Queue, shared: &Shared) {
     let _ = stream.set_nodelay(true);
     if stream.set_nonblocking(true).is_ok() {

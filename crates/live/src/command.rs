@@ -37,7 +37,7 @@ pub enum CommandError {
     /// Not a request.
     #[error("not a request: {0}")]
     Unreadable(String),
-    /// A target that is no position in view.
+    /// A target that is not a position in view.
     #[error("target {0} is outside what can be asked for ({1} um to {2} um)")]
     OutOfView(String, String, String),
     /// A note without text, or too long.

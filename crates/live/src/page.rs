@@ -16,7 +16,7 @@ pub(crate) fn asset(path: &str) -> Option<(&'static str, &'static str)> {
     })
 }
 
-/// The page itself; shown to whoever has a word.
+/// The page itself, for clients with a word.
 pub(crate) const INDEX: &str = include_str!("page/index.html");
 
 const SCRIPT: &str = "text/javascript; charset=utf-8";

@@ -88,7 +88,7 @@ impl Row {
     }
 }
 
-/// A crop of a frame, 8 bits, with what vision saw in it. Positions are along the channel in um; places in px of the crop.
+/// A crop of a frame, 8 bits, with vision's result. Positions are along the channel in um; places are in px of the crop.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
     /// Columns.

@@ -17,7 +17,7 @@ pub(crate) struct Shared {
     pub(crate) secrets: Secrets,
     pub(crate) address: SocketAddr,
     pub(crate) hello: Hello,
-    /// The hub sends what has come and ends; clients go on until `over`.
+    /// The hub sends all waiting data and ends; clients continue until `over`.
     pub(crate) ending: AtomicBool,
     pub(crate) over: AtomicBool,
     pub(crate) clients: Clients,

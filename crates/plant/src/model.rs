@@ -105,7 +105,7 @@ impl Model {
         }
     }
 
-    /// The model that a name or a path stands for: `eq6` is built in, anything else is a file.
+    /// The model of a name or a path: `eq6` is built in, anything else is a file.
     ///
     /// # Errors
     /// A file that cannot be read, and all that [`Self::from_toml_str`] refuses.

@@ -35,11 +35,11 @@ impl Quantity {
 pub struct QuantityError {
     /// Line of the key, from 1.
     pub line: usize,
-    /// Key as it stands there.
+    /// Key as written.
     pub key: String,
-    /// Value as it stands there.
+    /// Value as written.
     pub value: String,
-    /// What is wrong with it, and what to write.
+    /// The error, and what to write instead.
     pub problem: String,
     /// Key of a bare number.
     pub with_unit: &'static str,

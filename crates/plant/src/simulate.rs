@@ -99,7 +99,7 @@ impl Ago {
     }
 }
 
-/// What was noted at one instant of an interval.
+/// The note at one instant of an interval.
 #[derive(Debug, Clone, Copy, Default)]
 struct Note {
     bead_um: f64,

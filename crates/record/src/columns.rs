@@ -373,7 +373,7 @@ mod tests {
     #[test]
     fn a_row_of_a_pi_controller_that_moves_a_bead_stays_within_160_bytes_with_the_frame_of_its_batch()
      {
-        // What a batch of half a second adds to each row: description and padding of its buffers.
+        // Bytes that a batch of half a second adds to each row: description and padding of its buffers.
         const FRAME: usize = 6;
         let groups = [Group::Loop, Group::Truth, Group::Script];
         assert!(row_bytes(&groups) + FRAME <= 160, "{}", row_bytes(&groups));

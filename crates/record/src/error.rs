@@ -8,7 +8,7 @@ pub enum RecordError {
     /// A file or folder could not be made, read or written.
     #[error("{what} {}: {source}", path.display())]
     Io {
-        /// What was attempted, such as `cannot create`.
+        /// The failed operation, such as `cannot create`.
         what: &'static str,
         /// The file or folder.
         path: PathBuf,
@@ -87,7 +87,7 @@ pub enum RecordError {
     /// Arrow refused to encode.
     #[error("cannot encode {what}: {message}")]
     Encode {
-        /// What was to be encoded.
+        /// The data to encode.
         what: &'static str,
         /// Arrow's or Parquet's words.
         message: String,

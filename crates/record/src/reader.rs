@@ -164,8 +164,8 @@ impl RunReader {
     }
 
     /// The run as a plain record: commanded PZT displacement, and the bead position that the camera had delivered at the time of the
-    /// command. So it contains the camera's delay, as any record of two instruments does. Missing rows are filled: the command is held,
-    /// the bead not seen. Takes 24 bytes a row; an export has the other columns.
+    /// command. So it contains the camera's delay, as any record of two instruments does. Missing rows are filled with the held command
+    /// and without a bead. Takes 24 bytes a row; an export has the other columns.
     ///
     /// # Errors
     /// [`RecordError`] if the rows cannot be read, [`cellpos_table::TableProblem::TooShort`] with fewer than two.

@@ -74,7 +74,7 @@ impl Sessions {
         })
     }
 
-    /// The sessions as one source of rows on one time axis: each begins after a pause behind the last row of the one before.
+    /// The sessions as one source of rows on one time axis: each begins a pause after the last row of the session before.
     ///
     /// # Errors
     /// [`RecordError`] when a session cannot be read.

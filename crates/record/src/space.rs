@@ -24,8 +24,7 @@ pub fn free_bytes(folder: &Path) -> Option<u64> {
     Some(disk.f_bavail.saturating_mul(disk.f_frsize))
 }
 
-/// Refuses a run for which there is no room: one of some ticks, or one without an end, for which there must be room to
-/// begin.
+/// Refuses a run without enough room. A run without an end needs room to begin; one with a number of ticks needs room for all.
 ///
 /// # Errors
 /// [`RecordError::NoSpace`] with the needed and the free space.

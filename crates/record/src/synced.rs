@@ -209,7 +209,7 @@ mod tests {
     use super::*;
     use std::sync::mpsc::{Receiver, Sender, channel};
 
-    /// A file whose syncs begin, and end as the test says.
+    /// A file whose syncs begin and end under control of the test.
     fn held() -> (SyncedFile, Sender<io::Result<()>>, Receiver<()>) {
         let mut file = SyncedFile::new(tempfile::tempfile().unwrap());
         let (end, ends) = channel();

@@ -389,7 +389,7 @@ impl RunWriter {
         self.log.flush();
     }
 
-    /// What could not be written so far.
+    /// The data that could not be written so far.
     pub fn faults(&self) -> Faults {
         self.log.faults()
     }

@@ -186,7 +186,7 @@ impl Shape {
                     base64(&tile.png)
                 );
             }
-            // A nested svg clips what is drawn in it and needs no identifier, which would have to be unique in a page.
+            // A nested svg clips its content without an identifier, which would have to be unique in a page.
             Shape::Enter { at, size } => {
                 let (w, h) = (px(size.0), px(size.1));
                 let _ = write!(out, "<svg{} viewBox=\"0 0 {w} {h}\">", placed(*at, *size));

@@ -169,7 +169,7 @@ pub struct Figure {
 
 impl Figure {
     /// An empty figure. `name` becomes the file name of its SVG and CSV (letters, digits, `-` and `_` are kept);
-    /// `caption` stands below it.
+    /// `caption` is shown below it.
     pub fn new(name: &str, caption: &str) -> Self {
         Self {
             name: slug(name),

@@ -124,7 +124,7 @@ impl Report {
         self.section("Command").verbatim(line)
     }
 
-    /// Adds text as it stands, in letters of equal width: a command line, a file.
+    /// Adds preformatted text in letters of equal width: a command line, a file.
     pub fn verbatim(&mut self, text: &str) -> &mut Self {
         self.push(Block::Verbatim(text.to_owned()))
     }
@@ -298,7 +298,7 @@ impl Report {
         Ok(())
     }
 
-    /// The captions with what was done, to be pasted.
+    /// The captions and the description of the work, to be pasted.
     fn captions(&self) -> String {
         let mut out = typeset(&self.title);
         let leads = self.blocks.iter().filter_map(|block| match block {

@@ -353,7 +353,7 @@ mod tests {
         }
     }
 
-    /// Every object is where the table says, and every figure's data and words are in the page.
+    /// Every object is at its place in the table, and every figure's data and words are in the page.
     #[test]
     fn a_document_finds_its_objects_and_has_what_the_figure_has() {
         let x: Vec<f64> = (0..200).map(f64::from).collect();

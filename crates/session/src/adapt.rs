@@ -13,8 +13,8 @@ pub enum Adapt {
     Off,
 }
 
-/// The command line precedes the controller: `lqg` and `mpc` by name adapt, a controller.toml does as
-/// its key `adapt` in `[estimator]` says.
+/// The command line overrides the controller. By default `lqg` and `mpc`, given by name, adapt; a controller.toml
+/// follows its key `adapt` in `[estimator]`.
 pub fn choose(asked: Option<Adapt>, controller: &mut ControllerFile) {
     if let Some(asked) = asked {
         controller.estimator.adapt = asked == Adapt::On;

@@ -10,7 +10,7 @@ pub struct LiveLine {
     pub low_um: f64,
     /// Largest displacement, um.
     pub high_um: f64,
-    /// Which keys do what; empty: none are listened to.
+    /// The keys and their actions; empty: no keys.
     pub keys: &'static str,
     /// Number that the operator is typing.
     pub typed: Typed,

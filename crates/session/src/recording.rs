@@ -64,7 +64,7 @@ impl Recording {
             level,
             text,
         });
-        // Without a page nobody takes them.
+        // Without a page they have no receiver.
         self.told.truncate(100);
     }
 

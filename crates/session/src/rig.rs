@@ -458,7 +458,7 @@ pub struct Finished<S> {
     pub summary: Summary,
     /// Real-time conditions of the control thread.
     pub conditions: Conditions,
-    /// What was learned over cycles, for each periodic motion of the reference; `None`: without a learner.
+    /// The result of learning over cycles, for each periodic motion of the reference; `None` without a learner.
     pub learned: Vec<Option<LearnedTable>>,
     /// How the recording went.
     pub recorder: RecorderReport,

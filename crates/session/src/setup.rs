@@ -71,7 +71,7 @@ pub enum ReferenceSpec {
     },
 }
 
-/// What generates the reference of a loop: a position, or a script.
+/// The reference generator of a loop: a position, or a script.
 #[derive(Debug, Clone)]
 pub enum AnyReference {
     /// A position that the operator may move.

@@ -175,7 +175,7 @@ fn act(signal: i32) {
     }
 }
 
-/// What a key does: p or space pauses and continues, s skips to the next step, q stops.
+/// Executes a key: p or space pauses and continues, s skips to the next step, q stops.
 pub fn press(key: u8, operator: &Operator) {
     // Switches between two requests; has no effect after a stop request.
     let toggle = |from, to, back| {

@@ -70,7 +70,7 @@ pub(crate) fn grid(
         places.push(place);
     }
     let step_s = (last - first) / place as f64;
-    // Dust of decimal times such as 0.001 would otherwise change the last digits of whatever is computed with the step.
+    // Rounding of decimal times such as 0.001 would otherwise change the last digits of every result that uses the step.
     let whole_rate_hz = (1.0 / step_s).round();
     let dust = (whole_rate_hz * step_s - 1.0).abs() < 1e-9;
     Ok(Grid {

@@ -11,7 +11,7 @@ use cellpos_session::{Failure, FramesSeen, RigFile};
 use serde::Serialize;
 use std::path::Path;
 
-/// What was found behind the file.
+/// The devices and problems found for a file.
 #[derive(Debug, Clone, Serialize)]
 pub struct Connected {
     /// The board and its line; none if it could not be opened.
@@ -268,7 +268,7 @@ fn judge_camera(found: &mut Found, file: &RigFile, camera: &CameraSeen) {
         };
         let origin_px = calibration.origin_px;
         if !(0.0..=across.saturating_sub(1) as f64).contains(&origin_px) {
-            // The table, or the file that stands for it.
+            // The table, or the file that replaces it.
             let of = match &file.calibration_file {
                 Some(_) => ("", "calibration_file"),
                 None => ("calibration", "origin_px"),

@@ -28,7 +28,7 @@ pub struct Sight {
 }
 
 impl Sight {
-    /// Of frames as the rig file says.
+    /// The sight of frames with the rig file's settings.
     ///
     /// # Errors
     /// Invalid settings, or a frame of another size than the background of a cell.

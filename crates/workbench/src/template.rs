@@ -156,7 +156,7 @@ oldest = \"5ms\"           # older frames are not used
     )
 }
 
-/// What `--camera` names: an existing socket or a path, else an address.
+/// The meaning of `--camera`: an existing socket or a path, else an address.
 pub fn camera(text: &str) -> Camera {
     if Path::new(text).exists() || text.contains('/') || text.ends_with(".sock") {
         Camera::Socket(text.to_string())

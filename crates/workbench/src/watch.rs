@@ -25,7 +25,7 @@ pub(crate) struct Watch {
     buffer: FrameBuffer,
     aside: VecDeque<(i64, FrameBuffer)>,
     aside_bytes: usize,
-    /// What was seen, oldest first.
+    /// The beads seen, oldest first.
     pub(crate) sightings: Vec<Sighting>,
 }
 

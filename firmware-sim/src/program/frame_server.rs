@@ -29,7 +29,7 @@ impl FrameServer {
     /// Listens at `path`; a socket left behind there is replaced.
     ///
     /// # Errors
-    /// What the operating system refuses; something at `path` that is no socket.
+    /// A refusal of the operating system; an existing `path` that is not a socket.
     pub(super) fn listen(path: &Path) -> Result<Self, ProgramError> {
         let fail = |source| ProgramError::File {
             path: path.to_owned(),

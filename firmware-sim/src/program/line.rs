@@ -24,7 +24,7 @@ impl Line {
     /// Opens a new pseudo-terminal; with `link`, a symbolic link to it that goes away with the line.
     ///
     /// # Errors
-    /// What the operating system refuses; a `link` that exists and is no symbolic link.
+    /// A refusal of the operating system; a `link` that exists and is not a symbolic link.
     pub(super) fn open(link: Option<&Path>) -> Result<Self, ProgramError> {
         let opening = "opening a pseudo-terminal";
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
@@ -79,7 +79,7 @@ impl Line {
     /// Reads the host's bytes; 0 without any.
     ///
     /// # Errors
-    /// What the operating system refuses.
+    /// A refusal of the operating system.
     pub(super) fn read(&self, buffer: &mut [u8]) -> Result<usize, ProgramError> {
         match rustix::io::read(&self.board_end, buffer) {
             Ok(count) => Ok(count),
@@ -93,7 +93,7 @@ impl Line {
     /// Writes to the host. If nobody reads, it discards the old bytes, so that the next host gets new ones.
     ///
     /// # Errors
-    /// What the operating system refuses.
+    /// A refusal of the operating system.
     pub(super) fn write(&self, bytes: &[u8]) -> Result<(), ProgramError> {
         match rustix::io::write(&self.board_end, bytes) {
             Ok(count) if count == bytes.len() => Ok(()),
@@ -109,7 +109,7 @@ impl Line {
     /// Stops or resumes input from the host, like a USB line whose device does not answer.
     ///
     /// # Errors
-    /// What the operating system refuses.
+    /// A refusal of the operating system.
     pub(super) fn stall(&self, stalled: bool) -> Result<(), ProgramError> {
         let action = if stalled { Action::OOff } else { Action::OOn };
         tcflow(&self.host_end, action).map_err(ProgramError::system("stopping the pseudo-terminal"))

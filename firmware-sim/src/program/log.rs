@@ -41,7 +41,7 @@ impl Log {
     /// Starts a log; an existing file is replaced.
     ///
     /// # Errors
-    /// What the operating system refuses.
+    /// A refusal of the operating system.
     pub(super) fn create(path: &Path, start_ns: i64) -> Result<Self, ProgramError> {
         let file = File::create(path).map_err(|source| ProgramError::File {
             path: path.to_owned(),
@@ -82,7 +82,7 @@ impl Log {
         if now_ns < self.next_ns && !changed {
             return Ok(());
         }
-        // On the grid, unless a stall has put the log behind it.
+        // On the grid, unless a stall has delayed the log.
         if now_ns >= self.next_ns {
             self.next_ns = (self.next_ns + PERIOD_NS).max(now_ns - PERIOD_NS);
         }
@@ -109,7 +109,7 @@ impl Log {
     /// Passes everything to the operating system.
     ///
     /// # Errors
-    /// What the operating system refuses.
+    /// A refusal of the operating system.
     pub(super) fn flush(&mut self) -> Result<(), ProgramError> {
         self.file.flush().map_err(|source| ProgramError::File {
             path: self.path.clone(),

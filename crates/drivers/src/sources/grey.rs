@@ -23,8 +23,8 @@ pub(crate) fn refuse(path: &Path, frame: usize, found: String) -> SourceError {
     }
 }
 
-/// Puts the values into the buffer, whose size is set; `channels` in all, the last of which is transparency if the second
-/// says so. Returns its warnings.
+/// Writes the values into the buffer, whose size is set. A pixel has `channels` values; the last one is transparency if the
+/// second number of `channels` says so. Returns warnings.
 pub(crate) fn take(
     path: &Path,
     frame: usize,

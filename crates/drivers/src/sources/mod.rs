@@ -1,7 +1,7 @@
 //! Recordings on disk as cameras: folders of PNG, TIFF or JPEG pictures, TIFF stacks, Photron recordings, AVI films, NumPy
 //! arrays, `.rtdc` files.
 //!
-//! [`open`] tells the kind by the name; [`Playback`] plays a recording at its frame rate behind the
+//! [`open`] recognises the kind by the name; [`Playback`] plays a recording at its frame rate behind the
 //! [`Camera`](cellpos_rig::Camera) trait. Not for writing.
 
 pub mod avi;
@@ -232,7 +232,7 @@ pub trait Recording: Send + std::fmt::Debug {
 /// Opens a recording of any known kind and checks its first frame.
 ///
 /// # Errors
-/// The path is no recording, or cannot be read.
+/// The path is not a recording, or cannot be read.
 pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
     if path.is_dir() {
         return Ok(Box::new(PictureFolder::open(path)?));

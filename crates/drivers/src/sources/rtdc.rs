@@ -26,7 +26,7 @@ pub struct RtdcRecording {
     info: RecordingInfo,
     pictures: Rows,
     backgrounds: Option<Rows>,
-    /// Numbers of the frames, where they grow.
+    /// Numbers of the frames, if they grow.
     numbers: Vec<u64>,
 }
 

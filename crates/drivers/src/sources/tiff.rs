@@ -19,7 +19,7 @@ pub struct TiffStack {
     decoder: Decoder<BufReader<File>>,
     /// The decoder's page.
     page: usize,
-    /// Pictures one behind the other after the one directory.
+    /// Pictures one after the other, behind a single directory.
     raw: Option<RawStack>,
     info: RecordingInfo,
 }
@@ -308,7 +308,7 @@ fn check_compression(
     })
 }
 
-/// Pictures one behind the other, uncompressed, that only the description of the first counts.
+/// Uncompressed pictures one after the other; only the description of the first gives their number.
 #[derive(Debug)]
 struct RawStack {
     file: File,

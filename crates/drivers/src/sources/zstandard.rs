@@ -13,7 +13,7 @@ pub(crate) const ZSTANDARD: u16 = 32_015;
 /// Largest accepted chunk, bytes: a header that claims more is damaged.
 const LARGEST_CHUNK: u64 = 1 << 30;
 
-/// A dataset read row by row (along its first side), whatever its chunks are compressed by.
+/// A dataset read row by row (along its first side), with any compression of its chunks.
 #[derive(Debug)]
 pub(crate) struct Rows {
     dataset: Dataset,

@@ -56,7 +56,7 @@ pub struct Harmonic {
     pub input_ratio: f64,
     /// Probability that noise alone shows this much.
     pub p_value: f64,
-    /// Whether it exceeds both the noise and what the input's own harmonic can cause.
+    /// Whether it exceeds both the noise and the effect of the input's own harmonic.
     pub unexplained: bool,
 }
 

@@ -48,7 +48,7 @@ enum Message {
     Open,
     /// A picture for it, written unchanged.
     Draw(String),
-    /// It is given back.
+    /// It is released.
     Close,
 }
 
@@ -298,7 +298,7 @@ impl Write for Log {
     }
 }
 
-/// What happens to sequences that set colours.
+/// Treatment of sequences that set colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Colours {
     /// They are kept: they change only the look of text.

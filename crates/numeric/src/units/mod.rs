@@ -1,8 +1,8 @@
 //! Physical quantities with their unit in the type: micrometres, seconds, volts, hertz and what follows from them.
 //!
-//! Every boundary of cellpos (command line, files, records) speaks these units. A quantity is parsed from text only
-//! together with its unit; a bare number is refused with a sentence that says what to write. Not for arithmetic in
-//! the loop: inside a step function plain `f64` with the unit in the name (`error_um`) is used.
+//! Every boundary of cellpos (command line, files, records) speaks these units. The parser accepts a quantity only with
+//! its unit, and refuses a bare number with a sentence that says what to write. Not for arithmetic in the loop: step
+//! functions use plain `f64` with the unit in the name (`error_um`).
 //!
 //! ```
 //! use cellpos_numeric::units::{Micrometers, Seconds};

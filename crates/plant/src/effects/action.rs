@@ -4,7 +4,7 @@ use super::user::Seen;
 use crate::modal::Zpk;
 use std::fmt;
 
-/// What an effect does at its place.
+/// The action of an effect at its place.
 #[derive(Debug)]
 pub enum Action {
     /// A linear, time-invariant factor.
@@ -34,7 +34,7 @@ pub enum Action {
     Drop(f64),
     /// Probability of a frame that is delivered twice.
     Repeat(f64),
-    /// What the camera shows of a position.
+    /// The picture's position for a true one.
     Show(Box<dyn Shown>),
 }
 

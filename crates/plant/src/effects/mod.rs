@@ -132,7 +132,7 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// Id, place, parameters, words.
     fn spec(&self) -> &'static Spec;
 
-    /// What the effect with these numbers does at its place.
+    /// The action of the effect with these numbers at its place.
     fn act(&self, effect: &Effect) -> Action;
 
     /// The linear part at the start of a record, for an effect that changes with time, if any.
@@ -221,7 +221,7 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         Vec::new()
     }
 
-    /// The effect that candidate `index` stands for, with these values of its parameters.
+    /// The effect of candidate `index`, with these values of its parameters.
     fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect;
 
     /// Delay that candidate `index` adds to a slow motion \[s\], if any.
@@ -331,7 +331,7 @@ impl Effect {
         self.kind.spec().place
     }
 
-    /// What the effect does at its place.
+    /// The action of the effect at its place.
     pub fn act(&self) -> Action {
         self.kind.act(self)
     }

@@ -21,9 +21,9 @@ pub struct Spec {
     pub forms: &'static [Form],
     /// Ids with which it is confused.
     pub confused_with: &'static [&'static str],
-    /// Ids that no record of command and position tells from it.
+    /// Ids that no record of command and position separates from it.
     pub inseparable_from: &'static [&'static str],
-    /// The kind of record that tells it from the others.
+    /// The kind of record that separates it from the others.
     pub experiment: Experiment,
     /// The same in words.
     pub separate_by: &'static str,

@@ -177,8 +177,7 @@ const CANDIDATES: &[Candidate] = &[
         late: true,
         ..Candidate::chain(&[QUADRATIC, CUBIC])
     },
-    // For records of the piezo itself. Behind a chip, a cubic curve may come from a saturation or a spring, which are effects of their
-    // own.
+    // For records of the piezo itself. Behind a chip, a cubic curve may come from a saturation or a spring, which are separate effects.
     Candidate {
         name: "curved play",
         late: true,

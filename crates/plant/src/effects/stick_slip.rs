@@ -67,7 +67,7 @@ struct Stick {
 impl SpeedLaw for Stick {
     fn travel(&mut self, moved: f64, a: f64, b: f64, h_s: f64) -> f64 {
         if self.stuck {
-            // It breaks free within the piece, where the speed passes the threshold.
+            // It breaks free within the piece, when the speed passes the threshold.
             let limit = self.break_um_per_s;
             if a.abs() >= limit {
                 self.stuck = false;

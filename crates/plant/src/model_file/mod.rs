@@ -47,7 +47,7 @@ impl Model {
     ///
     /// # Errors
     /// Text that is not TOML, unknown keys, missing keys, wrong types, numbers that are not finite or out of range,
-    /// coefficients that make no plant. Each error names line, column and what would be right.
+    /// coefficients that do not make a plant. Each error names line, column and what would be right.
     pub fn from_toml_str(text: &str, file_name: &str) -> Result<Self, ModelError> {
         read(text, file_name)
     }

@@ -22,7 +22,7 @@ fn records(
     records_skipping(plan, bead, change, None)
 }
 
-/// The same, where the operator skips to the next step in a tick.
+/// The same, but the operator skips to the next step in a tick.
 fn records_skipping(
     plan: &Arc<Plan>,
     bead: impl Fn(f64, f64) -> f64,

@@ -26,7 +26,7 @@ pub struct Trend {
     pub last: Mean,
     /// Change per cycle, of a straight line through all.
     pub per_cycle: f64,
-    /// Half width of its 95 % interval, the residuals taken for white.
+    /// Half width of its 95 % interval, with residuals assumed white.
     pub ci95_per_cycle: f64,
     /// RMS of the residual of the straight line.
     pub residual: f64,
@@ -289,7 +289,7 @@ mod tests {
         ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64 - 0.5
     }
 
-    /// Of ten cycles of a steady change the mean is known as well as its scatter allows: the change is no scatter.
+    /// The interval of the mean of ten cycles with a steady change follows from their scatter alone: the change is not scatter.
     #[test]
     fn the_interval_of_a_mean_leaves_a_steady_change_out() {
         let (mut inside, mut widest) = (0, 0.0_f64);

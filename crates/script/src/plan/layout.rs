@@ -240,7 +240,7 @@ impl Layout<'_> {
         }
     }
 
-    /// A pass of a repeat or a sweep: a cycle, if there is no wave in it and no passes that were counted already.
+    /// A pass of a repeat or a sweep. It is a cycle if it contains neither a wave nor passes that count already.
     fn pass(&mut self, steps: &[Step]) -> Result<(), ScriptError> {
         let (start_s, cycles) = (self.time_s, self.next_cycle);
         self.steps(steps)?;

@@ -70,7 +70,7 @@ pub struct ClipReport {
     pub no_room: u64,
     /// Frames that found no empty buffer.
     pub frames_left_out: u64,
-    /// What went wrong with the first clip that could not be written.
+    /// The error of the first clip that could not be written.
     pub first_error: Option<String>,
 }
 
@@ -98,7 +98,7 @@ impl Clips {
         let crop = (width_px.min(crop::MOST.0), height_px.min(crop::MOST.1));
         let pixels = (crop.0 * crop.1).max(1);
         let wanted = (config.before_s + config.after_s + HEARD_AFTER_S) * rate_hz;
-        // Two bytes a pixel, whatever the camera sends.
+        // Two bytes per pixel for any camera.
         let count = (wanted.ceil() as usize).clamp(1, (MOST_MEMORY / (2 * pixels)).max(1));
         let (full, full_out) = RingBuffer::new(count);
         let (mut empty, empty_out) = RingBuffer::new(count);

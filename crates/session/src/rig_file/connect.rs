@@ -23,7 +23,7 @@ pub struct Connected {
     pub actuator: Box<dyn Actuator>,
     /// Its clock.
     pub clock: Clock,
-    /// What the user should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
     flow: CommandedFlow,
 }

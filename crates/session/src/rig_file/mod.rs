@@ -77,7 +77,7 @@ pub struct CellInView {
     /// has its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<PathBuf>,
-    /// What counts as a cell.
+    /// Criteria for a cell.
     pub finder: CellConfig,
 }
 

@@ -29,7 +29,7 @@ impl Screen {
     /// Takes the terminal behind standard error.
     ///
     /// # Errors
-    /// Standard error is no terminal, or no thread could be had.
+    /// Standard error is not a terminal, or no thread could be started.
     pub fn open(config: &ScreenConfig, hub: FeedHub) -> io::Result<Self> {
         if !io::IsTerminal::is_terminal(&io::stderr()) {
             return Err(io::Error::other(

@@ -96,7 +96,7 @@ fn snapshot(cpu: Option<usize>) -> BTreeMap<String, (f64, &'static str)> {
         let Ok(stat) = std::fs::read_to_string(entry.path().join("stat")) else {
             continue;
         };
-        // The name may hold blanks and brackets: the fields go on behind its last bracket.
+        // The name may contain blanks and brackets: the fields continue after its last bracket.
         if let (Some(open), Some(close)) = (stat.find('('), stat.rfind(')')) {
             let name = stat.get(open + 1..close).unwrap_or("?");
             let fields: Vec<&str> = stat

@@ -126,7 +126,7 @@ impl Tracing {
         }
     }
 
-    /// Who had the CPU, the longest first.
+    /// The users of the CPU, the longest first.
     pub(super) fn suspects(&self) -> Vec<Suspect> {
         const MOST: usize = 8;
         let mut all: Vec<Suspect> = self.found.values().cloned().collect();
@@ -222,10 +222,10 @@ fn runs(trace: &str) -> Vec<OnCpu> {
     all
 }
 
-/// Nobody: the CPU slept, or the host of a virtual machine had it.
+/// No task: the CPU slept, or the host of a virtual machine had it.
 const IDLE: &str = "nobody (the CPU was idle: it woke late, or a hypervisor had it)";
 
-/// Who had how much of a late window: ms, or how often an interrupt came.
+/// Share of each task in a late window: ms, or the number of interrupts.
 fn shares(runs: &[OnCpu], (from_ns, to_ns): (i64, i64)) -> BTreeMap<String, (f64, &'static str)> {
     let mut all = BTreeMap::new();
     for run in runs {

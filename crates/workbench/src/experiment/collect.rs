@@ -52,7 +52,7 @@ pub struct Collecting<'a> {
     pub seed: u64,
 }
 
-/// What was run on a rig, as a record.
+/// A run on a rig, as a record.
 #[derive(Debug, Clone)]
 pub struct Ran {
     /// The record.

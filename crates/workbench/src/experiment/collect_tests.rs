@@ -19,7 +19,7 @@ use cellpos_session::Failure;
 use cellpos_session::rig_file::{Frames, RigFile};
 use std::path::Path;
 
-/// An id, what is hidden, and the numbers that must be inside their intervals.
+/// An id, the hidden effect, and the numbers that must be inside their intervals.
 type Row = (&'static str, Option<Effect>, &'static [(&'static str, f64)]);
 
 /// One effect each, and nothing.

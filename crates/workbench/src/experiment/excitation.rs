@@ -45,7 +45,7 @@ impl Experiment {
         let open: Vec<&str> = std::iter::once(id)
             .chain(alternatives.iter().map(String::as_str))
             .collect();
-        // The same response from command to bead, whatever is commanded.
+        // The same response from command to bead for any command.
         let same = |a: &str, b: &str| open.len() == 2 && open.contains(&a) && open.contains(&b);
         if alternatives.is_empty() || same("driver-lag", "bubble") {
             return None;
@@ -81,7 +81,7 @@ impl Experiment {
         }
     }
 
-    /// What it does, in words.
+    /// Its description in words.
     pub fn what(self) -> &'static str {
         match self {
             Self::Survey => {

@@ -183,7 +183,7 @@ impl OnRig {
     /// Runs the segments `todo` of a plan once.
     ///
     /// # Errors
-    /// The rig could not be set up or armed. A run that ended early is no error: [`Acquired::trouble`].
+    /// The rig could not be set up or armed. A run that ended early is not an error: see [`Acquired::trouble`].
     pub fn acquire(
         &self,
         plan: &Plan,

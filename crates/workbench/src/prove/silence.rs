@@ -10,7 +10,7 @@ use cellpos_session::Failure;
 /// Watchdogs of the trial, ms: long enough that a machine under load can feed the first one, short enough to wait for.
 const WATCHDOG_MS: u16 = 100;
 const HOLD_MS: u16 = 300;
-/// What the board's own step and its message may add to a watchdog, ms.
+/// Time that the board's own step and its message may add to a watchdog, ms.
 const LATE_MS: f64 = 2.0;
 
 /// The lines of silence and of stops; the board is left disarmed and at park.

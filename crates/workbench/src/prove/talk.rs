@@ -72,7 +72,7 @@ impl Talk {
         Ok(())
     }
 
-    /// A message as it goes over the line.
+    /// A message in its form on the line.
     pub(super) fn wire(message: &ToBoard) -> Result<Vec<u8>, Failure> {
         let mut bytes = [0; MAX_FRAME];
         let length = encode(message, &mut bytes).map_err(Failure::failed)?;

@@ -13,7 +13,7 @@ const LARGEST: f64 = 1e12;
 pub struct Seen {
     /// Time since the start, s.
     pub time_s: f64,
-    /// Input of the place, measured from the rest of the model.
+    /// Input of the place, measured from the model's state of rest.
     pub input: f64,
     /// What the plant gives.
     pub position: f64,

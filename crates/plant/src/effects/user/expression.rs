@@ -53,7 +53,7 @@ impl Program {
     /// Compiles a text that may contain `names`.
     ///
     /// # Errors
-    /// A text that is no expression, an unknown name or function: what is wrong and what would be right.
+    /// A text that is not an expression, an unknown name or function: what is wrong and what would be right.
     pub(super) fn new(text: &str, names: &[&str]) -> Result<Self, ExpressionProblem> {
         minus_before_power(text)?;
         let mut slab = Slab::new();

@@ -50,7 +50,7 @@ pub struct Circle {
     pub base: (&'static str, String),
     /// The verdict.
     pub reconciled: Reconciliation,
-    /// What was recorded for it.
+    /// The records for it.
     pub collected: Vec<Collected>,
     /// As given, as identified, as reconciled.
     pub stages: Vec<Stage>,
