@@ -135,12 +135,9 @@ impl Chain {
                 s[0]
             }
             Hidden::Stiffening(c) => u + c * u.powi(3),
-            // s[0], s[1]: the stand; what it adds to the picture is read from outside.
+            // The stand; what it adds to the picture is read from outside.
             Hidden::Shake(hz, damping, share) => {
-                let w = TAU * hz;
-                s[1] += h * (w * w * (u - s[0]) - 2.0 * damping * w * s[1]);
-                s[0] += h * s[1];
-                s[2] = share * (u - s[0] - 2.0 * damping * s[1] / w);
+                s[2] = share * swung(s, u, TAU * hz, damping, h).1;
                 u
             }
             Hidden::Leak(corner) => u - lagged(&mut s[0], u, h * corner),
@@ -150,14 +147,7 @@ impl Chain {
                 u - share * turn_um * s[0]
             }
             Hidden::Lag(hz) => lagged(&mut s[0], u, h * TAU * hz),
-            Hidden::Resonance(hz, damping) => {
-                // Leapfrog, the speed half a step ahead: its mean over the step damps.
-                let w = TAU * hz;
-                let (before, drag) = (s[0], h * damping * w);
-                s[1] = ((1.0 - drag) * s[1] + h * w * w * (u - s[0])) / (1.0 + drag);
-                s[0] += h * s[1];
-                0.5 * (before + s[0])
-            }
+            Hidden::Resonance(hz, damping) => swung(s, u, TAU * hz, damping, h).0,
             Hidden::Relaxation(strength, time_s) => u - strength * lagged(&mut s[0], u, h / time_s),
             Hidden::Creep(per_decade) => {
                 // Half a decade apart.
@@ -169,8 +159,10 @@ impl Chain {
                 x
             }
             Hidden::Slew(rate) => {
-                s[0] += (u - s[0]).clamp(-rate * h, rate * h);
-                s[0]
+                // A ramp over a part of the step, then rest.
+                let goes = (u - s[0]).clamp(-rate * h, rate * h);
+                s[0] += goes;
+                s[0] - 0.5 * goes * goes.abs() / (rate * h)
             }
         }
     }
@@ -181,6 +173,36 @@ fn lagged(state: &mut f64, u: f64, share: f64) -> f64 {
     let (before, kept) = (*state, (-share).exp());
     *state = u + (before - u) * kept;
     u + (before - u) * (1.0 - kept) / share
+}
+
+/// Mean over a step of an oscillator's position, and its acceleration over `w^2` at the step's start; `state` (position and speed) goes on
+/// to the end of the step, by the midpoint rule.
+fn swung(state: &mut [f64], u: f64, w: f64, damping: f64, h: f64) -> (f64, f64) {
+    let (x, v) = (state[0], state[1]);
+    let bends = |x: f64, v: f64| w * w * (u - x) - 2.0 * damping * w * v;
+    let starts = bends(x, v) / (w * w);
+    let (x_half, v_half) = (x + 0.5 * h * v, v + 0.5 * h * bends(x, v));
+    state[0] = x + h * v_half;
+    state[1] = v + h * bends(x_half, v_half);
+    (x_half, starts)
+}
+
+#[test]
+fn what_is_hidden_comes_as_late_as_its_equation_says() {
+    let (h, slope) = (5e-5, 0.01);
+    // A lag of second order is 2 damping/w behind a ramp.
+    let mut chain = Chain::new(Hidden::Resonance(280.0, 0.1));
+    let mut late = 0.0;
+    for k in 0..20_000 {
+        let u = slope * f64::from(k);
+        late = (u - chain.advance(u, h)) / slope * h;
+    }
+    let right = 0.2 / (TAU * 280.0);
+    assert!((late - right).abs() < 1e-6, "{late} {right}");
+    // The mean of the n-th step of a ramp is that of its middle.
+    let mut chain = Chain::new(Hidden::Slew(100.0));
+    let mean = (0..100).map(|_| chain.advance(1.0, h)).last().unwrap();
+    assert!((mean - 99.5 * 100.0 * h).abs() < 1e-12, "{mean}");
 }
 
 /// What the loop adds to the command.
@@ -235,7 +257,7 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
     let mut wander = flow.wander_um * random.normal();
     let (mut x, mut walk, mut sum) = ([0.0, 0.0], 0.0, 0.0);
     let mut chain = Chain::new(hidden);
-    let (mut stuck, mut last) = (0.0, 0.0);
+    let (mut stuck, mut last, mut before) = (0.0, 0.0, 0.0);
     let (mut t, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
     for k in 0..ROWS {
         let now_s = k as f64 * ROW_S;
@@ -245,21 +267,26 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
             let input = chain.advance(commands[k * STEPS_A_ROW + i], step_s) - zero;
             let free = rest[0] * x[1] + rest[1] * x[0] + direct * input;
             if let Hidden::Adhesion(least) = hidden {
-                let speed = (free - last) / step_s;
+                // A jump is faster than any speed that sticks.
+                let smooth = free - direct * input;
+                let speed = (smooth - last) / step_s;
                 let slips = speed.signum() * (speed.abs() - least).max(0.0);
-                stuck += step_s * slips;
-                last = free;
+                stuck += step_s * slips + direct * (input - before);
+                (last, before) = (smooth, input);
             } else {
                 stuck = free;
             }
             if i == 0 {
+                // The frame shows bead and stand at one instant.
                 position = stuck;
+                if let Hidden::Shake(..) = hidden {
+                    position += chain.state[2];
+                }
             }
             let bends = input - slow[0] * x[1] - slow[1] * x[0];
             x = [x[0] + step_s * x[1], x[1] + step_s * bends];
         }
         let shown = match hidden {
-            Hidden::Shake(..) => chain.state[2],
             Hidden::Line(hz, um) => um * (TAU * hz * now_s + 0.6).sin(),
             _ => 0.0,
         };
