@@ -37,10 +37,12 @@ def held(folder, rig, law, model="eq6"):
 def test_a_bead_is_held_at_20_ms_a_command(rigs):
     pi, bound = held(rigs, "pressure.toml", "pi")
     lqg, _ = held(rigs, "pressure.toml", "lqg")
-    with_tube, _ = held(rigs, "tube.toml", "lqg", "integrator.toml")
-    print(f"PI {pi:.0f} nm, LQG {lqg:.0f} nm, LQG with a tube of 20 ms {with_tube:.0f} nm; dead time and noise alone: {bound:.0f} nm")
-    assert bound < lqg < 0.9 * pi < 240
-    assert lqg < with_tube < 270
+    mpc, _ = held(rigs, "pressure.toml", "mpc")
+    with_tube, bound_with_tube = held(rigs, "tube.toml", "lqg", "integrator.toml")
+    print(f"PI {pi:.0f} nm, LQG {lqg:.0f} nm, MPC {mpc:.0f} nm, bound {bound:.0f} nm; with a tube of 20 ms {with_tube:.0f} of {bound_with_tube:.0f} nm")
+    assert bound < lqg < 1.15 * bound and mpc < 1.15 * bound
+    assert lqg < 0.9 * pi < 240
+    assert bound_with_tube < with_tube < 1.15 * bound_with_tube
 
 
 def test_identify_finds_the_regulator(rigs):

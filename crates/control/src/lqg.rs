@@ -20,7 +20,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct Lqg {
     /// Weight of the motion that a command causes by the next tick, relative to the position error: 0.05 is close to minimum
-    /// variance, 10 is cautious; 3.8 is stable for twice the gain with one more sample of delay, however exact the fixes.
+    /// variance, 10 is cautious; 3.8 is stable for twice the gain with one more frame of delay where every tick has a frame, however
+    /// exact the fixes. [`Lqg::for_path`] finds that of other paths.
     pub effort: f64,
 }
 

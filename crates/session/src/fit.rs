@@ -70,7 +70,7 @@ fn exposure_s(file: &RigFile, model: &Model) -> f64 {
 pub fn prepare(model: &str, controller: &str, file: &RigFile) -> Result<Prepared, Failure> {
     let model = Model::load(model).map_err(Failure::input)?;
     let model = file.actuator.before(model);
-    let controller = setup::controller(controller, &model, &file.timing)?;
+    let controller = setup::controller(controller, &model, &file.timing, file.frame_s())?;
     Ok(Prepared { model, controller })
 }
 

@@ -9,8 +9,8 @@ use cellpos_control::design::{
     predicted_density_um,
 };
 use cellpos_control::{
-    Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Partner, PartnerConfig,
-    Profile, Shape,
+    Controller, ControllerConfig, ControllerFile, ControllerKind, Limits, Lqg, Mpc, Partner,
+    PartnerConfig, Profile, Shape,
 };
 use cellpos_ident::experiment::Turn;
 use cellpos_plant::Model;
@@ -391,9 +391,14 @@ pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
 /// flow as well as MPC, with less time per tick.
 pub const DEFAULT_LAW: &str = "lqg";
 
-/// A controller by name (`pi`, `lead`: gains found for the model and the delay; `lqg`, `mpc`: the default weights) or
-/// from a controller.toml.
-pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<ControllerFile, Failure> {
+/// A controller by name (`pi`, `lead`: gains found for the model and the delay; `lqg`, `mpc`: the weights of
+/// the path) or from a controller.toml. The camera has a frame each `frame_s`, s.
+pub fn controller(
+    name: &str,
+    model: &Model,
+    timing: &Timing,
+    frame_s: f64,
+) -> Result<ControllerFile, Failure> {
     let sample_s = timing.period_us * 1e-6;
     let loop_delay_s = loop_delay_s(model, timing);
     let Some(kind) = ControllerKind::from_name(name) else {
@@ -440,6 +445,8 @@ pub fn controller(name: &str, model: &Model, timing: &Timing) -> Result<Controll
     };
     let mut file = ControllerFile::from_pi(pi, loop_delay_s);
     file.controller = kind;
+    file.lqg = Lqg::for_path(&request.plant, frame_s);
+    file.mpc = Mpc::for_path(&request.plant, frame_s);
     file.sample_time_ms = sample_s * 1e3;
     if let Some(config) = &report.config {
         file.estimator = config.estimator;

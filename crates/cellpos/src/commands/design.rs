@@ -173,7 +173,9 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let limits = limits(&args)?;
     gains_belong_to(&args, &asked)?;
     let lead = lead(&args, &asked, plant.loop_delay_s())?;
-    let controller = requested(&args, &asked, &plant, &limits, lead)?;
+    // Without a rig file every tick has a frame.
+    let frame_s = (rig.as_ref()).map_or(plant.sample_time_s, RigFile::frame_s);
+    let controller = requested(&args, &asked, (&plant, frame_s), &limits, lead)?;
     let of_rig = rig.as_ref().map(|file| file.limits);
     let request = DesignRequest {
         plant,
@@ -185,7 +187,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     };
     let report = design(&request).map_err(Failure::input)?;
     if let Some(path) = &args.out {
-        let file = controller_file(given, &request, &report)?;
+        let file = controller_file(given, &request, &report, frame_s)?;
         output::write(path, &file.to_toml_string())?;
     }
     if let Some(path) = &args.report {
@@ -291,7 +293,7 @@ fn plant(
 fn requested(
     args: &Args,
     asked: &Choice,
-    plant: &DesignPlant,
+    (plant, frame_s): (&DesignPlant, f64),
     limits: &DesignLimits,
     lead: Option<Lead>,
 ) -> Result<Requested, Failure> {
@@ -302,10 +304,13 @@ fn requested(
         });
     }
     Ok(match (asked.law(), args.kp, args.ki) {
-        (ControllerKind::Lqg, ..) => Requested::Given(ControllerConfig::Lqg(Lqg::default())),
-        (ControllerKind::Mpc, ..) => {
-            Requested::Given(ControllerConfig::Mpc(Mpc::default(), fallback(plant)?))
+        (ControllerKind::Lqg, ..) => {
+            Requested::Given(ControllerConfig::Lqg(Lqg::for_path(plant, frame_s)))
         }
+        (ControllerKind::Mpc, ..) => Requested::Given(ControllerConfig::Mpc(
+            Mpc::for_path(plant, frame_s),
+            fallback(plant)?,
+        )),
         (_, Some(kp), Some(ki)) => Requested::Pi(Pi {
             lead,
             ..Pi::new(kp, ki)
@@ -389,6 +394,7 @@ fn controller_file(
     given: Option<&ControllerFile>,
     request: &DesignRequest,
     report: &DesignReport,
+    frame_s: f64,
 ) -> Result<ControllerFile, Failure> {
     let loop_delay_s = request.plant.loop_delay_s();
     if let Some(given) = given {
@@ -412,6 +418,12 @@ fn controller_file(
         },
     };
     file.sample_time_ms = request.plant.sample_time_s * 1e3;
+    if file.controller != ControllerKind::Lqg {
+        file.lqg = Lqg::for_path(&request.plant, frame_s);
+    }
+    if file.controller != ControllerKind::Mpc {
+        file.mpc = Mpc::for_path(&request.plant, frame_s);
+    }
     if let Some(config) = &report.config {
         file.estimator = config.estimator;
         file.limits = config.limits;

@@ -99,4 +99,33 @@ mod tests {
         let expected = (closed * closed + more_um2).sqrt();
         assert!((um / expected - 1.0).abs() < 2e-3, "{um} {expected}");
     }
+
+    #[test]
+    fn an_independent_calculation_finds_the_same() {
+        // State of the sampled path with the positions of the last milliseconds, its Kalman filter by iteration and state feedback whose
+        // commands cost 1e-9 (SciPy), nm: regulator, tube (s), fix noise (um), bound with a fix a tick.
+        let integrator = LoopModel::integrator(428.0, 2e-3);
+        for (regulator_s, tube_s, noise_um, expected_nm) in [
+            (0.05, 0.0, 0.00063, 120.50),
+            (0.05, 0.0, 0.03, 123.96),
+            (0.05, 0.02, 0.00063, 143.36),
+            (0.05, 0.02, 0.03, 146.27),
+        ] {
+            let mode = |own: f64, other: f64| LoopMode {
+                pole_rad_per_s: -1.0 / own,
+                residue_per_s: -428.0 * own / (own - other),
+            };
+            let second = match tube_s > 0.0 {
+                true => mode(tube_s, regulator_s),
+                false => LoopMode::default(),
+            };
+            let model = LoopModel {
+                modes: [mode(regulator_s, tube_s), second],
+                sample_time_s: 0.02,
+                ..integrator
+            };
+            let nm = 1e3 * bound_rms_of_path_um(0.33, noise_um, &model);
+            assert!((nm / expected_nm - 1.0).abs() < 1e-3, "{nm} {expected_nm}");
+        }
+    }
 }

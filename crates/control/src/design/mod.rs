@@ -7,6 +7,7 @@
 mod bound;
 mod curves;
 mod density;
+mod effort;
 mod learning;
 mod margins;
 mod noise;

@@ -332,7 +332,7 @@ fn loop_config(
 }
 
 /// The estimator for a plant's noise.
-fn estimator_config(plant: &DesignPlant) -> EstimatorConfig {
+pub(super) fn estimator_config(plant: &DesignPlant) -> EstimatorConfig {
     EstimatorConfig {
         diffusion_um2_per_s: positive_or(plant.diffusion_um2_per_s, 0.33),
         fix_noise_um: positive_or(plant.fix_noise_um, 0.020),

@@ -180,6 +180,16 @@ pub enum ClockKind {
 }
 
 impl RigFile {
+    /// Time from one frame of the camera to the next, s.
+    pub fn frame_s(&self) -> f64 {
+        1.0 / match self.camera {
+            CameraConfig::Emulated {} => self.emulator.rate_hz,
+            CameraConfig::Socket { rate_hz, .. } | CameraConfig::Industrial { rate_hz, .. } => {
+                rate_hz
+            }
+        }
+    }
+
     /// Reads a rig.toml; without one, the defaults.
     pub fn load(path: Option<&Path>) -> Result<Self, Failure> {
         let Some(path) = path else {

@@ -119,7 +119,7 @@ impl OnRig {
             ClockKind::Real
         });
         let model = file.actuator.before(model);
-        let mut controller = setup::controller("pi", &model, &file.timing)?;
+        let mut controller = setup::controller("pi", &model, &file.timing, file.frame_s())?;
         // Only the rig's own limits apply: the narrower ones of a controller are for holding, not for an excitation.
         controller.limits = file.limits;
         Ok(Self {

@@ -159,7 +159,8 @@ pub fn run(
         response,
     };
     // There may be no controller for a fitted model: that is a finding, not a reason to stop.
-    let (prepared, law) = match designed(&model, controller, &timing, sample_s) {
+    let (prepared, law) = match designed(&model, controller, &timing, rig.file.frame_s(), sample_s)
+    {
         Ok(designed) => designed,
         Err(Failure::BadInput(why)) => {
             stage.problem = Some(why.to_string());
@@ -212,11 +213,12 @@ fn designed(
     model: &Model,
     controller: &str,
     timing: &Timing,
+    frame_s: f64,
     sample_s: f64,
 ) -> Result<(Prepared, LinearLaw), Failure> {
     let linear = designable(model, sample_s)?;
     let prepared = Prepared {
-        controller: setup::controller(controller, &linear, timing)?,
+        controller: setup::controller(controller, &linear, timing, frame_s)?,
         model: linear,
     };
     let delay_s = prepared.controller.delay_ms * 1e-3;
