@@ -58,6 +58,7 @@ pub mod rig_file;
 mod running;
 pub mod say;
 pub mod screen;
+pub mod sessions;
 pub mod setup;
 pub mod signals;
 pub mod toml_file;

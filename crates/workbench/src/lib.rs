@@ -5,6 +5,7 @@
 //! - [`line_test`] measures the line to the board; [`mover`] moves the PZT by hand.
 //! - [`snapshot`] takes a picture, [`capture`] records frames, [`sight`] measures the noise of a position.
 //! - [`beads`] finds the settings of vision for the beads, [`calibrate`] axis, sign and scale; [`partner`] writes the slow actuator.
+//! - [`run_report`] writes the pages of recorded runs.
 //! - [`prove`] tests board, camera and vision line by line, [`doctor`] the machine.
 //!
 //! Closed loops are in `cellpos-session`.
@@ -34,6 +35,7 @@ pub mod mover;
 pub mod partner;
 pub mod prove;
 mod rig_text;
+pub mod run_report;
 pub mod sight;
 pub mod snapshot;
 pub mod template;

@@ -240,7 +240,10 @@ impl Base {
             match self.fit.form.delay {
                 true => format!(
                     "delay {} ms",
-                    super::report::with_interval(m.delay_s * 1e3, 1.96e3 * m.delay_sd_s)
+                    cellpos_workbench::run_report::with_interval(
+                        m.delay_s * 1e3,
+                        1.96e3 * m.delay_sd_s
+                    )
                 ),
                 false => "no delay".to_owned(),
             },

@@ -3,13 +3,13 @@
 use crate::commands::base;
 use crate::commands::columns::{self, Wanted};
 use crate::commands::identify::HoldKind;
-use crate::commands::run::resume::sessions;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
 use cellpos_ident::base::Grid;
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Hertz, Model, SimulateOptions, simulate};
 use cellpos_record::{RunReader, SESSIONS};
+use cellpos_session::sessions;
 use cellpos_table::{Mapping, Record, csv_field};
 use std::path::PathBuf;
 
@@ -58,7 +58,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     output::ready([&args.out])?;
     let model = Model::load(&args.model).map_err(Failure::input)?;
     let input = if args.input.is_dir() {
-        let sessions = sessions(&args.input).len();
+        let sessions = sessions::of(&args.input).len();
         if sessions > 1 {
             // Each begins with another bead.
             tracing::warn!(

@@ -1,10 +1,10 @@
 //! What came out of a circle, in sentences.
 
-use crate::commands::report::{half95, with_interval};
 use cellpos_reconcile::{Reconciliation, Verdict};
 use cellpos_report::Emphasis;
 use cellpos_workbench::experiment::circle::Circle;
 use cellpos_workbench::experiment::circle::stage::{Stage, Tracked};
+use cellpos_workbench::run_report::{half95, with_interval};
 
 /// One of a stage's two runs.
 pub(super) type OfStage = fn(&Stage) -> Option<&Tracked>;

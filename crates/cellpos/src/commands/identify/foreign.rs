@@ -5,7 +5,6 @@ use super::report::{log_grid, number};
 use super::sources::{self, Source};
 use crate::commands::base::{self, Base, coefficients};
 use crate::commands::form::Asked;
-use crate::commands::report::with_interval;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_ident::feedback::feedback;
 use cellpos_ident::foreign::{
@@ -15,6 +14,7 @@ use cellpos_ident::foreign::{
 use cellpos_ident::rational::RationalFit;
 use cellpos_plant::Model;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_workbench::run_report::with_interval;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};

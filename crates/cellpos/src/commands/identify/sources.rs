@@ -3,11 +3,11 @@
 use super::{Args, HoldKind};
 use crate::commands::arrays::read_table;
 use crate::commands::columns::{self, Wanted};
-use crate::commands::run::resume;
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
 use cellpos_runtime::{Life, TickFlags, TickRecord};
 use cellpos_session::recorded;
+use cellpos_session::sessions;
 use cellpos_session::setup::{ReferenceSpec, SetupConfig};
 use cellpos_table::{ColumnRef, Table};
 use std::collections::BTreeMap;
@@ -244,7 +244,7 @@ fn settled<T: Iterator<Item = Tick>>(
 
 /// The sessions of a run.
 fn runs(path: &Path) -> Result<Vec<Source>, Failure> {
-    let folders = resume::sessions(path);
+    let folders = sessions::of(path);
     let many = folders.len() > 1;
     let mut sources = Vec::new();
     for (number, folder) in (1u64..).zip(&folders) {

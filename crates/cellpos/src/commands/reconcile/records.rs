@@ -1,13 +1,13 @@
 //! The records that a reconciliation reads: CSV files and run folders, and the working point that they give.
 
 use crate::commands::columns::{self, Wanted};
-use crate::commands::run::resume::sessions;
 use crate::outcome::Failure;
 use cellpos_plant::effects;
 use cellpos_plant::{Hertz, Model, Noise, TransferFunction};
 use cellpos_reconcile::Record;
 use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
+use cellpos_session::sessions;
 use cellpos_workbench::experiment::collect::{neutral_um, refused};
 use cellpos_workbench::experiment::on_rig::{frame_age_ns, frames_passed_over, is_unseen};
 use std::path::{Path, PathBuf};
@@ -85,7 +85,7 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
     // A run that was resumed has a record for each of its sessions.
     Ok((found.iter())
         .flat_map(|path| match is_run(path) {
-            true => sessions(path),
+            true => sessions::of(path),
             false => vec![path.clone()],
         })
         .collect())

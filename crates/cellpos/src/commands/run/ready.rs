@@ -1,8 +1,8 @@
 //! Preparation of a script's run, before arming.
 
-use super::session_config::SessionConfig;
 use cellpos_record::InputFile;
 use cellpos_session::rig_file::{ClockKind, RigFile};
+use cellpos_session::sessions::SessionConfig;
 use cellpos_session::setup::{Prepared, ReferenceSpec};
 use std::path::PathBuf;
 

@@ -1,7 +1,6 @@
 //! A run that is gone on with: everything comes from its folder.
 
 use super::ready::Ready;
-use super::session_config::SessionConfig;
 use crate::outcome::Failure;
 use crate::rig_file::{ClockKind, RigFile};
 use crate::setup::{Prepared, ReferenceSpec};
@@ -11,6 +10,7 @@ use cellpos_record::{
 };
 use cellpos_runtime::{Stage, TickRecord};
 use cellpos_script::{ArmKind, CycleRow, CycleTable, read_cycles};
+use cellpos_session::sessions::{self, SessionConfig, session_config};
 use cellpos_table::read_text;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -48,7 +48,7 @@ pub(crate) fn cycles(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
 /// The cycles that the ticks of all sessions hold whole.
 fn counted(folder: &Path) -> Result<Vec<CycleRow>, Failure> {
     let mut rows = Vec::new();
-    for session in sessions(folder) {
+    for session in sessions::of(folder) {
         let reader = RunReader::open(&session).map_err(Failure::input)?;
         let Some(config) = session_config(&reader) else {
             continue;
@@ -132,31 +132,6 @@ pub(crate) fn cycles_parquet(folder: &Path, rows: &[CycleRow]) -> Result<(), Rec
     write_table_parquet(&folder.join(CYCLES_PARQUET), &columns)
 }
 
-/// The folders of a run's sessions, in order.
-pub(crate) fn sessions(folder: &Path) -> Vec<PathBuf> {
-    let mut found: Vec<(u64, PathBuf)> = vec![(1, folder.to_owned())];
-    let further = std::fs::read_dir(folder.join(SESSIONS))
-        .into_iter()
-        .flatten()
-        .flatten()
-        .map(|entry| entry.path());
-    for path in further {
-        if let Ok(reader) = RunReader::open(&path)
-            && let Some(config) = session_config(&reader)
-        {
-            found.push((config.number, path));
-        }
-    }
-    found.sort();
-    found.into_iter().map(|(_, path)| path).collect()
-}
-
-/// A session as described by its run.toml.
-pub(crate) fn session_config(reader: &RunReader) -> Option<SessionConfig> {
-    let config = reader.meta().ok()?.config.get("session")?.clone();
-    config.try_into().ok()
-}
-
 /// The next session of a run; None when nothing is left to do.
 pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure> {
     let not_a_run = |problem: String| {
@@ -196,7 +171,7 @@ pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, F
         .end
         .as_ref()
         .is_some_and(|end| WHOLE.contains(&end.outcome.as_str()));
-    let sessions = sessions(folder);
+    let sessions = sessions::of(folder);
     let last = sessions.last().map_or(folder, PathBuf::as_path);
     let last_done = is_done(last);
     // A script without a recorded end may still have a step after its last cycle.

@@ -1,7 +1,6 @@
 //! Where the records of a script go: the run folder, the per-cycle table, the progress bar.
 
 use super::learning::Keeper;
-use super::session_config::SessionConfig;
 use super::unshown::Unshown;
 use crate::recording::log_event;
 use cellpos_control::LearnerState;
@@ -12,6 +11,7 @@ use cellpos_runtime::recorder::Unconfirmed;
 use cellpos_runtime::{Event, Request, RunSink, Stage, Statistics, TickRecord};
 use cellpos_script::{Alarm, AmplitudeWatch, AtRest, CycleRow, CycleTable, FatigueWatch, Plan};
 use cellpos_session::say::say;
+use cellpos_session::sessions::SessionConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::ops::Range;
 use std::sync::Arc;

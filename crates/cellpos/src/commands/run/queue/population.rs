@@ -1,12 +1,12 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
-use crate::commands::report::{
-    OF_LENGTH, half95, length_between, rig_of, was_elsewhere, with_interval,
-};
 use crate::commands::run::over::Over;
 use crate::output::command_line;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, student95, trend};
+use cellpos_workbench::run_report::{
+    OF_LENGTH, half95, length_between, rig_of, was_elsewhere, with_interval,
+};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;

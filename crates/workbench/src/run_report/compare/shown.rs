@@ -1,8 +1,8 @@
 //! Figures and tables of several runs.
 
 use super::data::{ARMS, Compared, Quantity, values};
-use crate::commands::report::cycles::with_interval;
-use crate::commands::report::fatigue::{OF_LENGTH, tens};
+use crate::run_report::cycles::with_interval;
+use crate::run_report::fatigue::{OF_LENGTH, tens};
 use cellpos_report::{Axis, Column, Figure, Panel, Series, Table};
 use cellpos_script::ArmKind;
 

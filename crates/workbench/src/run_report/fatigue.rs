@@ -115,10 +115,10 @@ pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
 }
 
 /// What [`length_between`] is.
-pub(crate) const OF_LENGTH: &str = "Length at start: what the pause before a cycle leaves of the stretch; the first cycle, which begins at rest, is left out.";
+pub const OF_LENGTH: &str = "Length at start: what the pause before a cycle leaves of the stretch; the first cycle, which begins at rest, is left out.";
 
 /// Length at the start of a cycle that follows another; NaN of the first.
-pub(crate) fn length_between(row: &CycleRow) -> f64 {
+pub fn length_between(row: &CycleRow) -> f64 {
     match row.cycle {
         0 => f64::NAN,
         _ => row.length_start_um,

@@ -3,10 +3,10 @@
 use super::session::Session;
 use super::ticks::Ticks;
 use super::{bound, fatigue, origin};
-use crate::commands::run::resume;
-use crate::outcome::Failure;
 use cellpos_record::{CYCLES_CSV, RunReader};
 use cellpos_script::{ReadCycles, read_cycles};
+use cellpos_session::Failure;
+use cellpos_session::sessions::{self, session_config};
 use std::path::Path;
 
 /// A run as it was read, all its sessions together.
@@ -24,9 +24,9 @@ impl Recorded {
         let cycles = read_cycles(&text);
         let mut ticks = Ticks::with_courses(fatigue::courses(&cycles.rows));
         let mut sessions = Vec::new();
-        for folder in resume::sessions(run) {
+        for folder in sessions::of(run) {
             let reader = RunReader::open(&folder).map_err(Failure::input)?;
-            let gap_s = resume::session_config(&reader).and_then(|config| config.gap_s());
+            let gap_s = session_config(&reader).and_then(|config| config.gap_s);
             let start_s = if sessions.is_empty() {
                 0.0
             } else {

@@ -227,7 +227,7 @@ struct Group<'r> {
 
 /// Whether bead or cell was away from the script: its mean distance from the target exceeds a tenth of the stroke. In a good cycle it
 /// is a few per cent. Its lengths are of another place in the channel.
-pub(crate) fn was_elsewhere(row: &CycleRow) -> bool {
+pub fn was_elsewhere(row: &CycleRow) -> bool {
     const OF_STROKE: f64 = 0.1;
     row.arm == ArmKind::Cyclic && row.bias_um.abs() > OF_STROKE * row.stroke_um.abs()
 }
@@ -306,7 +306,7 @@ pub(super) fn short(value: f64) -> String {
 }
 
 /// A value with an interval, to the digits that the interval leaves it.
-pub(crate) fn with_interval(value: f64, ci95: f64) -> String {
+pub fn with_interval(value: f64, ci95: f64) -> String {
     let digits = digits_of(ci95);
     if !ci95.is_finite() {
         return format!("{value:.digits$} (no interval)");
@@ -324,7 +324,7 @@ pub(crate) fn digits_of(ci95: f64) -> usize {
 }
 
 /// Half the width of the 95 % interval of a mean, by Student's t.
-pub(crate) fn half95(values: &[f64]) -> f64 {
+pub fn half95(values: &[f64]) -> f64 {
     let n = values.len();
     if n < 2 {
         return f64::NAN;

@@ -1,14 +1,14 @@
 //! What of several runs is compared.
 
-use crate::commands::report::bound::Bound;
-use crate::commands::report::cycles::{on_the_way, was_elsewhere};
-use crate::commands::report::fatigue::length_between;
-use crate::commands::report::origin;
-use crate::commands::report::recorded::Recorded;
-use crate::commands::report::session::ending;
-use crate::outcome::Failure;
+use crate::run_report::bound::Bound;
+use crate::run_report::cycles::{on_the_way, was_elsewhere};
+use crate::run_report::fatigue::length_between;
+use crate::run_report::origin;
+use crate::run_report::recorded::Recorded;
+use crate::run_report::session::ending;
 use cellpos_report::Emphasis;
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
+use cellpos_session::Failure;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

@@ -5,10 +5,12 @@ mod shown;
 
 use super::cycles::{digits_of, half95, with_interval};
 use super::session::folder_name;
-use crate::outcome::{CommandResult, Failure, Outcome, print_json_of, print_text};
+use super::{Written, write};
 use cellpos_report::{Emphasis, Report};
 use cellpos_script::ArmKind;
+use cellpos_session::Failure;
 use data::{ARMS, BEAD, CELL, Compared, Ends, Quantity};
+use serde::Serialize;
 use shown::{errors, over_cycles, table_of_ends, table_of_runs};
 use std::path::{Path, PathBuf};
 
@@ -28,25 +30,30 @@ fn names(runs: &[PathBuf]) -> Vec<String> {
         .collect()
 }
 
-/// Writes the page.
-pub(super) fn run(runs: &[PathBuf], out: Option<&Path>, json: bool) -> CommandResult {
+/// Figures of a page of several runs.
+#[derive(Debug, Serialize)]
+pub struct FiguresOfMany {
+    runs: Vec<Compared>,
+}
+
+/// Writes the page of several runs; without `out`, comparison.html here.
+///
+/// # Errors
+/// As [`super::one`].
+pub fn compared(runs: &[PathBuf], out: Option<&Path>) -> Result<Written<FiguresOfMany>, Failure> {
     let mut compared = Vec::new();
     for (run, name) in runs.iter().zip(names(runs)) {
         compared.push(Compared::open(run, name)?);
     }
-    let out = out.map_or_else(|| PathBuf::from("comparison.html"), Path::to_owned);
-    let (page, sentence) = page(&compared);
-    page.write_with_figures(&out)
-        .map_err(|error| Failure::bad_input(error, "name a page that you may write with --out"))?;
-    if json {
-        print_json_of(
-            "comparison",
-            &serde_json::json!({ "out": out, "result": sentence, "runs": compared }),
-        )?;
-    } else {
-        print_text(&format!("{}\n", out.display()))?;
-    }
-    Ok(Outcome::Done)
+    let (page, result) = page(&compared);
+    Ok(Written {
+        out: write(
+            &page,
+            out.map_or_else(|| PathBuf::from("comparison.html"), Path::to_owned),
+        )?,
+        result,
+        figures: FiguresOfMany { runs: compared },
+    })
 }
 
 /// What the page compares: the quantities that at least one run has.

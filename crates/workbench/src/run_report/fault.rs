@@ -1,10 +1,10 @@
 //! What happened when Safe was latched: the last half second before it, as a picture and in sentences.
 
 use super::Session;
-use crate::outcome::Failure;
 use cellpos_record::{Event, RunReader};
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_runtime::{TickFlags, TickRecord};
+use cellpos_session::Failure;
 use std::collections::VecDeque;
 
 /// How much is shown before Safe, s, and behind it.
