@@ -186,14 +186,6 @@ pub(crate) fn write(path: &Path, text: &str) -> Result<(), Failure> {
     cellpos_table::write_atomically(path, text.as_bytes()).map_err(|error| refused(&error))
 }
 
-/// The command line as typed.
-pub(crate) fn command_line() -> String {
-    cellpos_session::provenance::command_line()
-        .iter()
-        .skip(1)
-        .fold("cellpos".to_owned(), |line, a| line + " " + a)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

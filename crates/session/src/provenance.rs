@@ -18,6 +18,14 @@ pub fn command_line() -> Vec<String> {
         .collect()
 }
 
+/// The command line as one text, the program without its folder.
+pub fn command_text() -> String {
+    command_line()
+        .iter()
+        .skip(1)
+        .fold("cellpos".to_owned(), |line, word| line + " " + word)
+}
+
 fn first_line(path: &str) -> Option<String> {
     let text = std::fs::read_to_string(path).ok()?;
     let line = text.lines().next().unwrap_or("").trim().to_owned();

@@ -5,6 +5,8 @@
 //! - [`line_test`] measures the line to the board; [`mover`] moves the PZT by hand.
 //! - [`snapshot`] takes a picture, [`capture`] records frames, [`sight`] measures the noise of a position.
 //! - [`beads`] finds the settings of vision for the beads, [`calibrate`] axis, sign and scale; [`partner`] writes the slow actuator.
+//! - [`foreign`] makes a base model of records of other rigs.
+//! - [`run_report`] writes the pages of recorded runs.
 //! - [`run_report`] writes the pages of recorded runs.
 //! - [`prove`] tests board, camera and vision line by line, [`doctor`] the machine.
 //!
@@ -30,6 +32,7 @@ mod connected;
 pub mod doctor;
 pub mod experiment;
 mod finding;
+pub mod foreign;
 pub mod line_test;
 pub mod mover;
 pub mod partner;

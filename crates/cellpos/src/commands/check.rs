@@ -374,7 +374,7 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits, args: &Args) -> 
     }
     report.section("Script");
     report.verbatim(&script.text);
-    report.command(&crate::output::command_line());
+    report.command(&cellpos_session::provenance::command_text());
     report
 }
 

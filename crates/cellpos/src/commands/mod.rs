@@ -1,8 +1,6 @@
 //! One module a command: `Args` (read by clap), `run(args)` (calls the libraries, prints the result).
 
-mod arrays;
 pub(crate) mod background;
-mod base;
 pub(crate) mod board;
 pub(crate) mod bundle;
 pub(crate) mod calibrate;
@@ -10,11 +8,9 @@ pub(crate) mod camera;
 mod camera_of_rig;
 pub(crate) mod check;
 pub(crate) mod circle;
-mod columns;
 pub(crate) mod design;
 pub(crate) mod doctor;
 pub(crate) mod export;
-pub(crate) mod form;
 pub(crate) mod generate;
 pub(crate) mod identify;
 pub(crate) mod jog;

@@ -3,8 +3,6 @@
 mod model;
 mod records;
 
-use crate::commands::columns;
-use crate::commands::form;
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -14,6 +12,7 @@ use cellpos_plant::effects::{self, Definition};
 use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Units, Verdict, figure_of};
 use cellpos_workbench::experiment::collect::{self, Collected, Collecting};
 use cellpos_workbench::experiment::on_rig::OnRig;
+use cellpos_workbench::foreign::{columns, form};
 use model::{Asked, Data};
 use records::{Columns, files, is_run, read, read_run};
 use std::path::{Path, PathBuf};
@@ -302,7 +301,7 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
             path,
             &cellpos_reconcile::report(result, &title)
                 .lead(&lead)
-                .command(&crate::output::command_line())
+                .command(&cellpos_session::provenance::command_text())
                 .to_html(),
         )?;
     }

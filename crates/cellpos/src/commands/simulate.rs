@@ -1,7 +1,5 @@
 //! `cellpos simulate`: the noise-free response of a model to the commands of a record.
 
-use crate::commands::base;
-use crate::commands::columns::{self, Wanted};
 use crate::commands::identify::HoldKind;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -11,6 +9,8 @@ use cellpos_plant::{Hertz, Model, SimulateOptions, simulate};
 use cellpos_record::{RunReader, SESSIONS};
 use cellpos_session::sessions;
 use cellpos_table::{Mapping, Record, csv_field};
+use cellpos_workbench::foreign::base;
+use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::path::PathBuf;
 
 /// Arguments of `cellpos simulate`.

@@ -3,10 +3,10 @@
 mod data;
 mod shown;
 
-use super::cycles::{digits_of, half95, with_interval};
+use super::cycles::half95;
 use super::session::folder_name;
 use super::{Written, write};
-use cellpos_report::{Emphasis, Report};
+use cellpos_report::{Emphasis, Report, digits_of, with_interval};
 use cellpos_script::ArmKind;
 use cellpos_session::Failure;
 use data::{ARMS, BEAD, CELL, Compared, Ends, Quantity};

@@ -1,6 +1,6 @@
 //! The cycles of a run: trends of each motion, and the static arm.
 
-use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table, with_interval};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, student95, trend};
 use std::collections::BTreeMap;
 
@@ -303,24 +303,6 @@ fn groups(rows: &[CycleRow]) -> Vec<Group<'_>> {
 pub(super) fn short(value: f64) -> String {
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_string()
-}
-
-/// A value with an interval, to the digits that the interval leaves it.
-pub fn with_interval(value: f64, ci95: f64) -> String {
-    let digits = digits_of(ci95);
-    if !ci95.is_finite() {
-        return format!("{value:.digits$} (no interval)");
-    }
-    // One value, one line.
-    format!("{value:.digits$}\u{a0}±\u{a0}{ci95:.digits$}")
-}
-
-/// Decimals that an interval leaves a value.
-pub(crate) fn digits_of(ci95: f64) -> usize {
-    match ci95 > 0.0 && ci95.is_finite() {
-        true => (1.0 - ci95.log10().floor()).clamp(0.0, 9.0) as usize,
-        false => 4,
-    }
 }
 
 /// Half the width of the 95 % interval of a mean, by Student's t.

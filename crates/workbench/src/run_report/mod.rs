@@ -27,7 +27,7 @@ use cellpos_script::CycleRow;
 use cellpos_session::Failure;
 use cellpos_session::cyclic::{NamedTable, load_learned};
 pub use compare::compared;
-pub use cycles::{half95, was_elsewhere, with_interval};
+pub use cycles::{half95, was_elsewhere};
 pub use fatigue::{OF_LENGTH, length_between};
 use origin::what_it_was;
 use recorded::Recorded;

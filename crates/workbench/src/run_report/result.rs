@@ -5,7 +5,7 @@ use super::bound::Bound;
 use super::error_figure::{mean, motions};
 use super::origin;
 use super::ticks::Ticks;
-use cellpos_report::{Emphasis, Report};
+use cellpos_report::{Emphasis, Report, with_interval};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use cellpos_session::connect::ENDED;
 
@@ -120,8 +120,8 @@ fn cyclic(rows: &[CycleRow], of: impl Fn(&CycleRow) -> f64) -> Option<Trend> {
 fn change(found: &Trend) -> String {
     format!(
         "from {} to {}",
-        super::with_interval(found.first.mean, found.first.ci95),
-        super::with_interval(found.last.mean, found.last.ci95)
+        with_interval(found.first.mean, found.first.ci95),
+        with_interval(found.last.mean, found.last.ci95)
     )
 }
 
@@ -209,7 +209,7 @@ fn over_cycles(rows: &[CycleRow]) -> Option<String> {
         .filter(|square| square.is_finite())
         .collect();
     let half_nm = super::half95(&squares) / (2.0 * rms_nm);
-    Some(super::with_interval(rms_nm, half_nm))
+    Some(with_interval(rms_nm, half_nm))
 }
 
 /// What the error over cycles is, for [`super::head`].
@@ -241,7 +241,7 @@ fn of_waves(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said
     let cycles: usize = reached.iter().map(|(_, values)| values.len()).sum();
     let said: Vec<String> = (reached.iter())
         .map(|(um, values)| {
-            let share = super::with_interval(100.0 * mean(values), 100.0 * super::half95(values));
+            let share = with_interval(100.0 * mean(values), 100.0 * super::half95(values));
             format!("{share} % of {} um", super::cycles::short(*um))
         })
         .collect();
@@ -294,7 +294,7 @@ fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>, what: &str, kept: bool) -> Op
     let rms_um = ticks.rms_um()?;
     let (error, of_interval) = match ticks.rms_ci95_um() {
         Some(ci95_um) => (
-            super::with_interval(1e3 * rms_um, 1e3 * ci95_um) + " nm RMS",
+            with_interval(1e3 * rms_um, 1e3 * ci95_um) + " nm RMS",
             "\u{b1} is the 95 % interval of the error in this one run, from its scatter over time. ",
         ),
         None => (format!("{} nm RMS", nm(rms_um)), ""),

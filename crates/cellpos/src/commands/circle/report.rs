@@ -1,8 +1,8 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
 use super::answer::{RUNS, error, rms, sentence, verdict_and_names};
-use crate::output::command_line;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_session::provenance::command_text;
 use cellpos_workbench::experiment::circle::Circle;
 use cellpos_workbench::experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
 use cellpos_workbench::experiment::circle::stage::Stage;
@@ -190,7 +190,7 @@ pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     reconciled(&mut r, circle, gap);
     margins(&mut r, circle);
     tracking(&mut r, circle);
-    r.command(&command_line());
+    r.command(&command_text());
     r
 }
 

@@ -1,12 +1,12 @@
 //! The page of a design: whether it holds, by how much, and what error it leads one to expect.
 
-use crate::output::command_line;
 use cellpos_control::ControllerConfig;
 use cellpos_control::design::{
     DesignReport, DesignRequest, loop_response, predicted_density_um, step_response,
 };
 use cellpos_plant::PlantError;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_session::provenance::command_text;
 
 /// Points of a curve over frequency.
 const POINTS: usize = 400;
@@ -53,7 +53,7 @@ pub(super) fn page(
         report.margins.delay_margin_s * 1e3
     ));
     let Some(law) = report.law(&request.plant) else {
-        page.command(&command_line());
+        page.command(&command_text());
         return Ok(page);
     };
     let end_hz = 0.5 / request.plant.sample_time_s;
@@ -103,7 +103,7 @@ pub(super) fn page(
     for warning in &report.warnings {
         page.note(Emphasis::Warning, &warning.to_string());
     }
-    page.command(&command_line());
+    page.command(&command_text());
     Ok(page)
 }
 

@@ -1,10 +1,8 @@
 //! `cellpos identify --data`: anybody's records.
 
 use super::Args;
-use super::report::{log_grid, number};
+use super::report::log_grid;
 use super::sources::{self, Source};
-use crate::commands::base::{self, Base, coefficients};
-use crate::commands::form::Asked;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_ident::feedback::feedback;
 use cellpos_ident::foreign::{
@@ -13,8 +11,11 @@ use cellpos_ident::foreign::{
 };
 use cellpos_ident::rational::RationalFit;
 use cellpos_plant::Model;
-use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
-use cellpos_workbench::run_report::with_interval;
+use cellpos_report::{
+    Axis, Column, Emphasis, Figure, Panel, Report, Series, Table, number, with_interval,
+};
+use cellpos_workbench::foreign::base::{self, Base, coefficients};
+use cellpos_workbench::foreign::form::Asked;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -126,7 +127,7 @@ fn base_of(
             output: s.output.clone(),
         })
         .collect();
-    let hold = base::hold_of(args.hold);
+    let hold = args.hold.into();
     let found = base::fit(
         &records,
         rate_hz,
@@ -164,7 +165,7 @@ fn judge(source: &Source, args: &Args) -> Result<ForeignResult, cellpos_ident::I
     let settings = ForeignSettings {
         rate_hz: source.rate_hz,
         most_order: usize::from(args.order),
-        hold: base::hold_of(args.hold),
+        hold: args.hold.into(),
     };
     let (input, output) = (&source.input, &source.output);
     let found = feedback(input, output);

@@ -1,8 +1,8 @@
 //! What `cellpos identify` prints.
 
-use super::report::number;
 use cellpos_ident::identifiability::Identifiability;
 use cellpos_plant::{Hertz, TransferFunction};
+use cellpos_report::number;
 use cellpos_workbench::experiment::identify::{Done, Job};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;

@@ -10,15 +10,16 @@ mod tables;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
-pub(crate) use crate::output::command_line;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use crate::view_args::{self, PageArgs};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ};
+use cellpos_ident::sampled::Hold;
 use cellpos_numeric::units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
 use cellpos_session::provenance;
+use cellpos_session::provenance::command_text;
 use cellpos_session::rig_file::ActuatorConfig;
 use cellpos_session::view::{Page, Pages};
 use cellpos_workbench::experiment::identify::held_bead::Setup;
@@ -74,7 +75,7 @@ pub(crate) struct Args {
     rows: Option<String>,
     /// Form of the model: order=N, with zeros=N, delay, integrating if you want them; or static. Default, or auto: the simplest that predicts as well as any, up to --order.
     #[arg(long, help_heading = ON_RECORDS)]
-    base: Option<super::form::Asked>,
+    base: Option<cellpos_workbench::foreign::form::Asked>,
     /// Input between rows: a command is held (zero-order), a measured signal is not (none).
     #[arg(long, value_enum, default_value_t = HoldKind::ZeroOrder, help_heading = ON_RECORDS)]
     hold: HoldKind,
@@ -155,6 +156,15 @@ pub(crate) enum HoldKind {
     ZeroOrder,
     /// Samples of a smooth signal.
     None,
+}
+
+impl From<HoldKind> for Hold {
+    fn from(kind: HoldKind) -> Self {
+        match kind {
+            HoldKind::ZeroOrder => Self::ZeroOrder,
+            HoldKind::None => Self::None,
+        }
+    }
 }
 
 /// A new folder below runs/, named by the time and `name`.
@@ -390,7 +400,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         ),
     };
     let provenance = BTreeMap::from([
-        ("command".to_owned(), command_line()),
+        ("command".to_owned(), command_text()),
         (
             "version".to_owned(),
             provenance::VERSION_AND_COMMIT.to_owned(),
@@ -413,7 +423,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
             .map_err(Failure::failed)?
     };
     output::write(&model_path, &model.to_toml_string())?;
-    report::report(&done, &rig, &command_line(), args.eq6)
+    report::report(&done, &rig, &command_text(), args.eq6)
         .write_with_figures(&report_path)
         .map_err(Failure::failed)?;
     if args.json {

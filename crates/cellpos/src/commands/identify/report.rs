@@ -2,11 +2,11 @@
 
 pub(crate) use super::bode::{Shown, bode, log_grid};
 use super::tables::interval;
-pub(crate) use super::tables::{candidates, lines, number, parameters};
+pub(crate) use super::tables::{candidates, lines, parameters};
 use cellpos_ident::frequency_response::FrequencyPoint;
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
-use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series};
+use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series, number};
 use cellpos_workbench::experiment::identify::Done;
 
 /// Nyquist plot of the record and the fitted model with hold and delay.

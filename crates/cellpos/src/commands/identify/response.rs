@@ -1,13 +1,13 @@
 //! `cellpos identify --response`: a base model from a table of frequency and response that somebody else has measured.
 
 use super::Args;
-use super::report::number;
-use crate::commands::arrays::read_table;
-use crate::commands::base::{self, coefficients};
-use crate::commands::form::Asked;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_ident::from_response::{Measured, ResponseFit, fit_response};
+use cellpos_report::number;
 use cellpos_table::{ColumnRef, Table};
+use cellpos_workbench::foreign::arrays::read_table;
+use cellpos_workbench::foreign::base::{self, coefficients};
+use cellpos_workbench::foreign::form::Asked;
 use serde_json::json;
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -22,7 +22,7 @@ pub(super) fn run(args: &Args, path: &Path) -> CommandResult {
             "check the columns, give more frequencies, or another form in --base",
         )
     })?;
-    let mut model = base::model_of(&fit.model, base::hold_of(args.hold), 0.0)?;
+    let mut model = base::model_of(&fit.model, args.hold.into(), 0.0)?;
     model.description = format!(
         "linear model of order {} from a frequency response",
         fit.form.order

@@ -1,8 +1,6 @@
 //! What `cellpos identify --data` reads: run folders and records of cellpos; other files by their columns.
 
 use super::{Args, HoldKind};
-use crate::commands::arrays::read_table;
-use crate::commands::columns::{self, Wanted};
 use crate::outcome::Failure;
 use cellpos_record::RunReader;
 use cellpos_runtime::{Life, TickFlags, TickRecord};
@@ -10,6 +8,8 @@ use cellpos_session::recorded;
 use cellpos_session::sessions;
 use cellpos_session::setup::{ReferenceSpec, SetupConfig};
 use cellpos_table::{ColumnRef, Table};
+use cellpos_workbench::foreign::arrays::read_table;
+use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::collections::BTreeMap;
 use std::path::Path;
 

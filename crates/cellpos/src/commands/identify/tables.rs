@@ -3,34 +3,7 @@
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
 use cellpos_plant::{Hertz, TransferFunction};
-use cellpos_report::{Column, Emphasis, Table};
-
-/// A number with digits fit for reading.
-pub(crate) fn number(value: f64) -> String {
-    if value == 0.0 {
-        "0".to_owned()
-    } else if !value.is_finite() {
-        if value.is_nan() {
-            "not known".to_owned()
-        } else if value > 0.0 {
-            "no bound".to_owned()
-        } else {
-            "no lower bound".to_owned()
-        }
-    } else if value.abs() >= 1e7 {
-        format!("{value:.2e}")
-    } else if value.abs() >= 1000.0 {
-        format!("{value:.0}")
-    } else if value.abs() >= 100.0 {
-        format!("{value:.1}")
-    } else if value.abs() >= 1.0 {
-        format!("{value:.3}")
-    } else if value.abs() >= 1e-3 {
-        format!("{value:.4}")
-    } else {
-        format!("{value:.3e}")
-    }
-}
+use cellpos_report::{Column, Emphasis, Table, number};
 
 pub(super) fn interval(ends: [f64; 2]) -> String {
     format!("{} .. {}", number(ends[0]), number(ends[1]))

@@ -1,6 +1,6 @@
 //! A row of the table: the paper's value, the value here, and whether they agree.
 
-use crate::commands::identify::report::number;
+use cellpos_report::number;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::Path;

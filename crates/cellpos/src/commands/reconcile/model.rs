@@ -2,8 +2,6 @@
 //! explains the difference.
 
 use super::records::{at_rest_of_records, fitted, with_camera_delay};
-use crate::commands::base::{self, Base};
-use crate::commands::form;
 use crate::commands::identify::HoldKind;
 use crate::commands::simulate::response;
 use crate::outcome::Failure;
@@ -15,6 +13,8 @@ use cellpos_plant::{
 };
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict, reconcile};
 use cellpos_workbench::experiment::collect::refused;
+use cellpos_workbench::foreign::base::{self, Base};
+use cellpos_workbench::foreign::form;
 
 /// Records and their properties.
 pub(super) struct Data<'a> {
@@ -49,7 +49,7 @@ pub(super) fn model_of(
     let mut model = match args.base {
         Some(asked) => {
             let hold = args.hold.unwrap_or(HoldKind::ZeroOrder);
-            let base = fit(data.records, &[], base::hold_of(hold), asked.form())?;
+            let base = fit(data.records, &[], hold.into(), asked.form())?;
             for line in base.words().lines() {
                 tracing::info!("{line}");
             }

@@ -1,6 +1,5 @@
 //! The records that a reconciliation reads: CSV files and run folders, and the working point that they give.
 
-use crate::commands::columns::{self, Wanted};
 use crate::outcome::Failure;
 use cellpos_plant::effects;
 use cellpos_plant::{Hertz, Model, Noise, TransferFunction};
@@ -10,6 +9,7 @@ use cellpos_runtime::TickRecord;
 use cellpos_session::sessions;
 use cellpos_workbench::experiment::collect::{neutral_um, refused};
 use cellpos_workbench::experiment::on_rig::{frame_age_ns, frames_passed_over, is_unseen};
+use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::path::{Path, PathBuf};
 
 /// Where CSV files have what, and in which units.

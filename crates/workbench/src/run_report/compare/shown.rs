@@ -1,9 +1,8 @@
 //! Figures and tables of several runs.
 
 use super::data::{ARMS, Compared, Quantity, values};
-use crate::run_report::cycles::with_interval;
 use crate::run_report::fatigue::{OF_LENGTH, tens};
-use cellpos_report::{Axis, Column, Figure, Panel, Series, Table};
+use cellpos_report::{Axis, Column, Figure, Panel, Series, Table, with_interval};
 use cellpos_script::ArmKind;
 
 /// Means of ten cycles of each run, side by side so that each is seen.

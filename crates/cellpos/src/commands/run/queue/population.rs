@@ -1,12 +1,10 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
 use crate::commands::run::over::Over;
-use crate::output::command_line;
-use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
+use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table, with_interval};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, student95, trend};
-use cellpos_workbench::run_report::{
-    OF_LENGTH, half95, length_between, rig_of, was_elsewhere, with_interval,
-};
+use cellpos_session::provenance::command_text;
+use cellpos_workbench::run_report::{OF_LENGTH, half95, length_between, rig_of, was_elsewhere};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -377,7 +375,7 @@ pub(super) fn page(name: &str, rows: &[CellRow], cycles: &[Vec<CycleRow>]) -> Re
             .map(|row| format!("cell {}: {}", row.cell, row.run))
             .collect::<Vec<_>>(),
     );
-    page.command(&command_line());
+    page.command(&command_text());
     page
 }
 

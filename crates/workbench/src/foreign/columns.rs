@@ -1,16 +1,16 @@
 //! The columns of a file: one reader for `identify`, `reconcile` and `simulate`, so that all read the same files.
 
 use super::arrays::read_table;
-use crate::outcome::Failure;
+use crate::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, refused};
 use cellpos_numeric::units::Hertz;
 use cellpos_reconcile::Record;
+use cellpos_session::Failure;
 use cellpos_table::{ColumnRef, Table};
-use cellpos_workbench::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, refused};
 use std::path::Path;
 
 /// Columns of a record, and how they are to be taken.
 #[derive(Debug, Clone)]
-pub(super) struct Wanted<'a> {
+pub struct Wanted<'a> {
     /// Column of the input.
     pub input: &'a str,
     /// Column of the output; None where only the input is wanted.
@@ -34,7 +34,7 @@ const TIMES: [&str; 6] = ["time", "t", "zeit", "timestamp", "tiempo", "temps"];
 ///
 /// # Errors
 /// What cannot be read, with what would be right.
-pub(super) fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
+pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
     let text = read_table(path).map_err(|e| {
         Failure::bad_input(
             format!("{}: cannot be read ({e})", path.display()),
@@ -158,7 +158,7 @@ fn hold_over_gaps(record: &mut Record) {
 }
 
 /// The names of columns as in the file; as requested if it has none.
-pub(super) fn names_in(path: &Path, asked: [&str; 2]) -> [String; 2] {
+pub fn names_in(path: &Path, asked: [&str; 2]) -> [String; 2] {
     let header = read_table(path).ok();
     let table = header
         .as_deref()
@@ -171,7 +171,7 @@ pub(super) fn names_in(path: &Path, asked: [&str; 2]) -> [String; 2] {
 }
 
 /// The unit of a column as its name says it: in brackets, or behind the last `_`; None where it says none that is known.
-pub(super) fn unit_of(name: &str) -> Option<&str> {
+pub fn unit_of(name: &str) -> Option<&str> {
     const KNOWN: [&str; 40] = [
         "V", "mV", "kV", "A", "mA", "W", "kW", "N", "mN", "kN", "Nm", "m", "mm", "cm", "um", "nm",
         "degC", "\u{b0}C", "C", "K", "bar", "mbar", "Pa", "kPa", "MPa", "rpm", "rad", "deg", "Hz",

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 /// A form as it is given on the command line: stated, or chosen by the records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Asked {
+pub enum Asked {
     /// By how well halves of the records predict each other.
     Chosen,
     /// As it is stated.
@@ -25,7 +25,7 @@ impl FromStr for Asked {
 
 impl Asked {
     /// The stated form, if there is one.
-    pub(crate) fn form(self) -> Option<Form> {
+    pub fn form(self) -> Option<Form> {
         match self {
             Self::Chosen => None,
             Self::Stated(form) => Some(form),
@@ -34,10 +34,10 @@ impl Asked {
 }
 
 /// Highest order that is tried where nobody states one.
-pub(crate) const MOST_ORDER: usize = 4;
+pub const MOST_ORDER: usize = 4;
 
 /// Forms that hold one thing more than another: a pole, a delay.
-pub(crate) fn richer(form: Form) -> Vec<Form> {
+pub fn richer(form: Form) -> Vec<Form> {
     let delayed = Form {
         delay: true,
         ..form

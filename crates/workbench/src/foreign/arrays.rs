@@ -13,7 +13,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// [`io::Error`] with a sentence.
-pub(super) fn read_table(path: &Path) -> io::Result<String> {
+pub fn read_table(path: &Path) -> io::Result<String> {
     let kind = path.extension().and_then(|e| e.to_str()).unwrap_or("");
     match kind.to_ascii_lowercase().as_str() {
         "npy" => npy(&read_bytes(path, MOST_OF_A_RECORD)?),

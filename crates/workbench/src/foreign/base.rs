@@ -1,20 +1,21 @@
 //! The base model of a plant that is not this rig's: fitted to records in time, written as a model file, said in words.
 
 use super::form::richer;
-use super::identify::HoldKind;
-use super::identify::report::number;
-use crate::outcome::Failure;
 use cellpos_ident::base::{BaseFit, Form, Series, choose};
 use cellpos_ident::rational::RationalFit;
 use cellpos_ident::sampled::Hold;
 use cellpos_plant::{Model, Noise, TransferFunction, effects};
+use cellpos_report::{number, with_interval};
+use cellpos_session::Failure;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
-/// Provenance of a model of other data: how its input was sampled, its form, and the output while its input rests.
-pub(super) const HOLD: &str = "hold";
+/// Provenance of a model of other data: how its input was sampled.
+pub const HOLD: &str = "hold";
+/// Provenance: its form.
 const FORM: &str = "base";
-pub(super) const REST_OUTPUT: &str = "rest_output";
+/// Provenance: the output while the input rests.
+pub const REST_OUTPUT: &str = "rest_output";
 
 /// Marks of the inputs that a base was fitted to.
 const RECORDS: &str = "records";
@@ -30,16 +31,9 @@ fn mark(input: &[f64]) -> String {
 }
 
 /// Whether a model says that it was fitted to a record of this input.
-pub(super) fn was_fitted_to(model: &Model, input: &[f64]) -> bool {
+pub fn was_fitted_to(model: &Model, input: &[f64]) -> bool {
     let marks = model.provenance.get(RECORDS);
     marks.is_some_and(|marks| marks.split(' ').any(|known| known == mark(input)))
-}
-
-pub(super) fn hold_of(kind: HoldKind) -> Hold {
-    match kind {
-        HoldKind::ZeroOrder => Hold::ZeroOrder,
-        HoldKind::None => Hold::None,
-    }
 }
 
 fn hold_word(hold: Hold) -> &'static str {
@@ -50,13 +44,15 @@ fn hold_word(hold: Hold) -> &'static str {
 }
 
 /// The form that a model says it was fitted with.
-pub(super) fn form_of(model: &Model) -> Option<Form> {
+pub fn form_of(model: &Model) -> Option<Form> {
     model.provenance.get(FORM)?.parse().ok()
 }
 
 /// A fitted base model and its messages.
-pub(super) struct Base {
+pub struct Base {
+    /// The fit.
     pub fit: BaseFit,
+    /// What the input does between rows.
     pub hold: Hold,
     /// What a user should know before using it.
     pub advice: Vec<String>,
@@ -70,7 +66,7 @@ pub(super) struct Base {
 ///
 /// # Errors
 /// Records that cannot be fitted.
-pub(super) fn fit(
+pub fn fit(
     records: &[Series],
     rate_hz: f64,
     hold: Hold,
@@ -184,7 +180,7 @@ fn too_poor(
 ///
 /// # Errors
 /// Records of different rates.
-pub(super) fn common_rate(rates: impl Iterator<Item = f64>) -> Result<f64, Failure> {
+pub fn common_rate(rates: impl Iterator<Item = f64>) -> Result<f64, Failure> {
     let rates: Vec<f64> = rates.collect();
     let first = rates.first().copied().unwrap_or(f64::NAN);
     match rates.iter().find(|rate| (*rate / first - 1.0).abs() > 1e-3) {
@@ -201,7 +197,7 @@ impl Base {
     ///
     /// # Errors
     /// A model that no file can hold.
-    pub(super) fn model(&self) -> Result<Model, Failure> {
+    pub fn model(&self) -> Result<Model, Failure> {
         let (low, high) = self.range;
         let span = high - low;
         let rest = self.fit.rest_input.filter(|rest| {
@@ -230,7 +226,7 @@ impl Base {
     }
 
     /// Messages about it.
-    pub(super) fn words(&self) -> String {
+    pub fn words(&self) -> String {
         let m = &self.fit.model;
         let mut text = format!(
             "base model {}: num {}, den {}, {}\n  its free run is off by {} RMS; the output moves by {} RMS",
@@ -240,10 +236,7 @@ impl Base {
             match self.fit.form.delay {
                 true => format!(
                     "delay {} ms",
-                    cellpos_workbench::run_report::with_interval(
-                        m.delay_s * 1e3,
-                        1.96e3 * m.delay_sd_s
-                    )
+                    with_interval(m.delay_s * 1e3, 1.96e3 * m.delay_sd_s)
                 ),
                 false => "no delay".to_owned(),
             },
@@ -264,7 +257,7 @@ impl Base {
     }
 
     /// The same as JSON.
-    pub(super) fn to_json(&self) -> Value {
+    pub fn to_json(&self) -> Value {
         let m = &self.fit.model;
         json!({
             "form": self.fit.form.to_string(), "order": m.order, "num": m.numerator, "num_sd": finite(&m.numerator_sd),
@@ -283,7 +276,7 @@ fn finite(values: &[f64]) -> Vec<Value> {
 }
 
 /// Coefficients with their 95 % intervals.
-pub(super) fn coefficients(values: &[f64], sds: &[f64]) -> String {
+pub fn coefficients(values: &[f64], sds: &[f64]) -> String {
     let terms: Vec<String> = values
         .iter()
         .zip(sds)
@@ -296,7 +289,7 @@ pub(super) fn coefficients(values: &[f64], sds: &[f64]) -> String {
 }
 
 /// Says in a model with which form it was fitted.
-pub(super) fn say_form(model: &mut Model, form: Form) {
+pub fn say_form(model: &mut Model, form: Form) {
     model.provenance.insert(FORM.to_owned(), form.to_string());
 }
 
@@ -304,7 +297,7 @@ pub(super) fn say_form(model: &mut Model, form: Form) {
 ///
 /// # Errors
 /// A model that no file can hold.
-pub(super) fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<Model, Failure> {
+pub fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<Model, Failure> {
     let plant = TransferFunction::new(best.numerator.clone(), best.denominator.clone())
         .map_err(Failure::failed)?;
     let delay_s = best.delay_s.max(0.0);
@@ -329,7 +322,10 @@ pub(super) fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<M
         covariance: None,
         intervals,
         provenance: BTreeMap::from([
-            ("command".to_owned(), super::identify::command_line()),
+            (
+                "command".to_owned(),
+                cellpos_session::provenance::command_text(),
+            ),
             (
                 "version".to_owned(),
                 cellpos_session::provenance::VERSION_AND_COMMIT.to_owned(),

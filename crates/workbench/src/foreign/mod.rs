@@ -1,0 +1,10 @@
+//! Records of other rigs, from a file to a base model.
+//!
+//! 1. [`arrays`] reads a file (text, `.npy`, `.mat`) as a table.
+//! 2. [`columns`] takes a record from the table: input, output, time.
+//! 3. [`base`] fits a linear model to such records and writes it as a model file; [`form`] is its order, stated or chosen.
+
+pub mod arrays;
+pub mod base;
+pub mod columns;
+pub mod form;
