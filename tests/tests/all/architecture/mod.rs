@@ -374,6 +374,8 @@ fn a_layer_knows_only_what_stands_below_it() {
                 "record",
                 "ident",
                 "reconcile",
+                "report",
+                "script",
             ],
         ),
     ];
