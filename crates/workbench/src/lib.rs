@@ -7,7 +7,6 @@
 //! - [`beads`] finds the settings of vision for the beads, [`calibrate`] axis, sign and scale; [`partner`] writes the slow actuator.
 //! - [`foreign`] makes a base model of records of other rigs.
 //! - [`run_report`] writes the pages of recorded runs.
-//! - [`run_report`] writes the pages of recorded runs.
 //! - [`prove`] tests board, camera and vision line by line, [`doctor`] the machine.
 //!
 //! Closed loops are in `cellpos-session`.
