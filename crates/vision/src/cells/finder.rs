@@ -405,7 +405,9 @@ fn is_of_two(outline: &Outline) -> bool {
     let sd = DENT_SIGMA * outline.point_variance.sqrt();
     let short_px = short_half_axis_px(outline);
     let [deepest, second] = outline.dents_px;
+    // Where the outline has no edge it goes over a gap between two. A gap that is narrower than an edge does not show.
     outline.solidity < LEAST_SOLIDITY
+        || outline.open_px > outline.edge_px
         || deepest > DENT * short_px + sd
         || second > 0.25 * deepest && deepest + second > WAIST * short_px + sd
 }

@@ -43,6 +43,7 @@ impl Outliner {
         contrast: &Contrast,
         variance: f64,
         (rim_grey, halo_grey): (f64, f64),
+        edge_px: f64,
     ) -> Option<Outline> {
         let n = self.points.len();
         let &(x0, y0) = self.points.first()?;
@@ -138,8 +139,28 @@ impl Outliner {
             solidity: (area / hull_area).min(1.0),
             dents_px: self.dents_px(),
             point_variance: point_variance / n as f64,
+            open_px: self.open_px(),
+            edge_px,
             at_border,
         })
+    }
+
+    /// Length of the longest stretch of the contour that has no edge, px.
+    fn open_px(&self) -> f64 {
+        let n = self.points.len();
+        let (mut open, mut longest) = (0.0, 0.0_f64);
+        // Twice round, for a stretch over the first point.
+        for i in 0..2 * n {
+            let (a, b) = (self.points[i % n], self.points[(i + 1) % n]);
+            let has_edge = |k: usize| self.amplitudes[k % n] > normals::AMPLITUDES.0;
+            if has_edge(i) || has_edge(i + 1) {
+                open = 0.0;
+            } else {
+                open += f64::hypot(b.0 - a.0, b.1 - a.1);
+                longest = longest.max(open);
+            }
+        }
+        longest
     }
 
     /// Depths of the two deepest dents below the convex hull that was laid last, px.

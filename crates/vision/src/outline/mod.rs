@@ -148,6 +148,10 @@ pub(crate) struct Outline {
     pub dents_px: [f64; 2],
     /// Variance of a point of the contour along its normal, px^2.
     pub point_variance: f64,
+    /// Length of the longest stretch of the contour that has no edge, px.
+    pub open_px: f64,
+    /// Width of the edge, from the rim to the halo, px.
+    pub edge_px: f64,
     pub at_border: bool,
 }
 
@@ -252,7 +256,8 @@ impl Outliner {
         self.shift_outwards(edge.at_px);
         let residual = self.residual().max(noise * noise);
         self.shift_by_smear();
-        self.measure(contrast, residual, (edge.rim_grey, edge.halo_grey))
+        let edge_px = profile.edge_width_px();
+        self.measure(contrast, residual, (edge.rim_grey, edge.halo_grey), edge_px)
     }
 
     /// Standard deviation of what the blur has moved the edge by, px. It shows when the profile is blurred by as much once more. To

@@ -11,7 +11,7 @@ const MOST_SHIFT_PX: f64 = 1.0;
 /// Share of the pixels' noise variance that is left in a shift: values between the pixels are means of them.
 const INTERPOLATED: f64 = 0.75;
 /// Amplitudes of a normal's profile that count as the same rim, relative to the mean one.
-const AMPLITUDES: (f64, f64) = (0.25, 4.0);
+pub(super) const AMPLITUDES: (f64, f64) = (0.25, 4.0);
 
 /// The mean profile along the normals.
 #[derive(Debug, Clone, Copy)]

@@ -171,18 +171,9 @@ fn changed_cells() {
                     [(x, y); 2]
                 },
             );
-            // One of nine is laid just inside of the border that cuts it.
-            let (least, most) = if px < 0.0 {
-                (row.drawn, row.drawn)
-            } else {
-                (0, 1)
-            };
+            let whole = if px < 0.0 { row.drawn } else { 0 };
             let good = row.areas.len();
-            assert!(
-                good >= least && good <= most,
-                "{} {what}: {row:?}",
-                lab.name
-            );
+            assert_eq!(good, whole, "{} {what}: {row:?}", lab.name);
         }
     }
 }

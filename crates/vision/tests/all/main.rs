@@ -8,6 +8,7 @@ mod common;
 mod detector;
 mod learnt;
 mod measured_beads;
+mod membranes;
 mod no_allocation;
 mod range;
 mod real_cells;
