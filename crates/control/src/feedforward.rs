@@ -1,11 +1,14 @@
 //! Feed-forward from the inverse of the strictly proper plant: the command that makes the model follow the reference.
 //!
-//! The sampled plant `y_(k+1) = C A s_k + C B u_k` has all its zeros inside the unit circle, so `u_k` follows from the
-//! next reference. (The biproper form of Eq. (6) has a zero at z = -19.3 and must never be inverted.)
+//! Where the sampled plant `y_(k+1) = C A s_k + C B u_k` has all its zeros inside the unit circle, `u_k` follows from the next
+//! reference. A zero outside (two lags: regulator and tube) would make that command grow from tick to tick; then the command is that
+//! of the smallest sum of squared errors, which reaches a reference later. (The biproper form of Eq. (6) has a zero at z = -19.3 and
+//! must never be inverted.)
 
 use crate::deviation::{DEVIATION, Deviation};
 use crate::limits::Limits;
 use crate::loop_model::{LoopModel, MODES};
+use crate::riccati::lq_feedback;
 
 /// State of the inverse: the model's state on the reference.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -88,18 +91,22 @@ pub(crate) struct FeedForward {
     gain: f64,
     feedthrough: f64,
     direct: f64,
+    /// Motion that is still to come of the modes, in um of the next tick.
+    to_come: [f64; MODES],
 }
 
 impl FeedForward {
     pub(crate) fn new(model: &LoopModel) -> Self {
         let d = Deviation::new(model);
+        let (direct, to_come) = inverse(&d);
         Self {
+            direct,
+            to_come,
             a: std::array::from_fn(|i| d.a[(i + 1, i + 1)]),
             b: std::array::from_fn(|i| d.b[i + 1]),
             c: std::array::from_fn(|i| d.c[i + 1]),
             gain: d.b[0],
             feedthrough: d.c[DEVIATION - 1],
-            direct: (&d.c * &d.b)[0],
         }
     }
 
@@ -114,9 +121,7 @@ impl FeedForward {
 
     /// Displacement from neutral that takes the model from its state to the next reference, um.
     pub(crate) fn wanted(&self, state: &FeedForwardState, next_um: f64) -> f64 {
-        let modes: f64 = (0..MODES)
-            .map(|i| self.c[i] * self.a[i] * state.modes[i])
-            .sum();
+        let modes: f64 = (0..MODES).map(|i| self.to_come[i] * state.modes[i]).sum();
         (next_um - state.integrator_um - modes) / self.direct
     }
 
@@ -232,9 +237,35 @@ impl FeedForward {
     }
 }
 
+/// Motion by the next tick for 1 um, and for 1 um s of each mode, of which the command follows.
+fn inverse(d: &Deviation) -> (f64, [f64; MODES]) {
+    /// Cost of a command over that of the motion that it causes, for the equation to have a solution.
+    const NEXT_TO_NONE: f64 = 1e-6;
+    let direct = (&d.c * &d.b)[0];
+    let exact = (
+        direct,
+        std::array::from_fn(|i| d.c[i + 1] * d.a[(i + 1, i + 1)]),
+    );
+    if zeros_are_inside(d) {
+        return exact;
+    }
+    let weight = NEXT_TO_NONE * direct * direct;
+    lq_feedback(&d.a, &d.b, &(d.c.transpose() * &d.c), weight).map_or(exact, |(f, _)| {
+        (1.0 / f[0], std::array::from_fn(|i| f[i + 1] / f[0]))
+    })
+}
+
+/// Whether the command that reaches each next reference stays bounded: the eigenvalues of the plant under it are 0 and the zeros.
+fn zeros_are_inside(d: &Deviation) -> bool {
+    let direct = (&d.c * &d.b)[0];
+    let under = &d.a - &d.b * (&d.c * &d.a / direct);
+    (under.complex_eigenvalues().iter()).all(|zero| zero.norm() < 1.0)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::loop_model::LoopMode;
     use cellpos_plant::{DiscretePlant, Seconds, TransferFunction};
 
     #[test]
@@ -262,5 +293,29 @@ mod tests {
             plant.step(&mut x, u);
         }
         assert!(largest < 20.0, "the inverse is stable: {largest}");
+    }
+
+    #[test]
+    fn behind_two_lags_the_command_is_bounded_and_the_bead_arrives() {
+        // Regulator and tube of 50 and 20 ms: a zero at -2.68.
+        let (k, one, two) = (428.0, 0.05, 0.02);
+        let mode = |own: f64, other: f64| LoopMode {
+            pole_rad_per_s: -1.0 / own,
+            residue_per_s: -k * own / (own - other),
+        };
+        let model = LoopModel {
+            modes: [mode(one, two), mode(two, one)],
+            sample_time_s: 0.02,
+            ..LoopModel::integrator(k, 2e-3)
+        };
+        let forward = FeedForward::new(&model);
+        let mut state = FeedForward::rest(0.0);
+        let mut largest: f64 = 0.0;
+        for tick in 0..400 {
+            largest = largest.max(forward.step(&mut state, 1.0).abs());
+            let left = forward.position(&state) - 1.0;
+            assert!(tick < 20 || left.abs() < 1e-3, "tick {tick}: {left}");
+        }
+        assert!(largest < 2.0, "{largest}");
     }
 }
