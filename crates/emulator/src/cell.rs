@@ -34,6 +34,8 @@ pub struct CellConfig {
     pub recovery_last_s: f64,
     /// Passages over which it tires; later ones change nothing.
     pub fatigue_passages: u32,
+    /// Passages that it made before this run; a run that is resumed counts its cycles.
+    pub passages_before: u32,
     /// Contrast of the body, as a share of `contrast_grey`; negative: darker than the background.
     pub body: f64,
     /// Contrast of rim and halo at 1 um out of focus, as a share of `contrast_grey`.
@@ -59,6 +61,7 @@ impl Default for CellConfig {
             recovery_first_s: 0.16,
             recovery_last_s: 0.37,
             fatigue_passages: 180,
+            passages_before: 0,
             body: 1.0,
             halo: 0.5,
             focus_um: 0.5,
@@ -142,7 +145,7 @@ impl Cell {
         Self {
             config,
             length_um: config.rest_um,
-            passages: 0,
+            passages: config.passages_before,
             was_inside: false,
             noise: Random::stream(seed, 3),
         }

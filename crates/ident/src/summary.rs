@@ -216,6 +216,13 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
             result.selection.scale.sqrt()
         ));
     }
+    if let Some(noise) = result.measured.noise.filter(|noise| !noise.used) {
+        out.push(format!(
+            "the scatter of the lines is no Brownian motion with a noise of fixes (p = {:.4}): the diffusion of {:.2} um2/s holds what \
+             else shook the bead or the clocks, and is an upper limit",
+            noise.p_value, noise.diffusion_um2_per_s
+        ));
+    }
     let gain = result.judged.model.gain_per_s;
     if let Some(stated) = stated_per_s
         && let Some(ratio) = literal_per_hertz(gain, stated)

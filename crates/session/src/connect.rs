@@ -237,12 +237,20 @@ pub fn not_armed(writer: RunWriter, failure: &Failure) {
     let _ = writer.finish(end);
 }
 
+/// Whether a hold of some seconds reached less than a bound by more than chance: then the bound is of a diffusion or a delay that is
+/// too large. Both errors in the same unit, without the noise of the camera.
+pub fn is_beaten(bound: f64, reached: f64, duration_s: f64) -> bool {
+    /// Time over which the error of a hold is correlated, s: a loop of 30 Hz or so.
+    const CORRELATED_S: f64 = 0.005;
+    // An RMS of n independent values has a relative standard deviation of 1/sqrt(2 n); three standard deviations.
+    let unsure = 3.0 * (CORRELATED_S / duration_s.max(CORRELATED_S)).sqrt();
+    reached < bound * (1.0 - unsure)
+}
+
 /// Smallest RMS error that any controller could reach, nm: from the assumed Brownian motion and noise, with the delay that the run
 /// measured, not the configured one. `None` if the run did better: then the stated diffusion or noise is wrong, and the figure is not a
 /// bound.
 pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<f64> {
-    /// Time over which the error of a hold is correlated, s: a loop of 30 Hz or so.
-    const CORRELATED_S: f64 = 0.005;
     let noise_nm = summary.fix_noise_nm?;
     let timing = &setup.config.timing;
     let measured_s = 1e-3 * summary.loop_delay_ms - 0.5e-6 * timing.period_us;
@@ -254,10 +262,18 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
     let bound_nm = 1e3 * bound_of_um(setup, diffusion, noise_nm * 1e-3, delay_s);
     let measured_nm = |nm: f64| (nm * nm - noise_nm * noise_nm).max(0.0).sqrt();
     let reached_nm = (summary.rms_true_nm).or(summary.rms_measured_nm.map(measured_nm));
-    // An RMS of n independent values has a relative standard deviation of 1/sqrt(2 n); three standard deviations.
-    let unsure = 3.0 * (CORRELATED_S / summary.duration_s.max(CORRELATED_S)).sqrt();
-    let beaten = reached_nm.is_some_and(|nm| nm < bound_nm * (1.0 - unsure));
+    let beaten = reached_nm.is_some_and(|nm| is_beaten(bound_nm, nm, summary.duration_s));
     (!beaten).then_some(bound_nm)
+}
+
+/// The lowest possible error as people read it, nm.
+pub fn possible_text(bound_rms_nm: Option<f64>) -> String {
+    match bound_rms_nm {
+        Some(nm) => format!("{nm:.1} nm RMS (Brownian motion, loop delay, noise of these fixes)"),
+        None => "not stated: no error was measured, or it is below what the model says is possible. Then the model's diffusion or delay is \
+                 too large: identify again"
+            .to_owned(),
+    }
 }
 
 /// The bound of a set-up's path with another camera path, um.

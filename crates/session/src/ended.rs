@@ -21,6 +21,8 @@ pub enum EndKind {
     ReferenceOver,
     /// The operator ended it; the bead was frozen, then the PZT parked.
     Operator,
+    /// A limit of the script was passed; the bead was frozen, then the PZT parked.
+    Stopped,
     /// The loop was never closed: the plant did not respond to the arming pulse as the model predicts, or no bead was seen.
     ArmingRefused,
     /// It ran for its whole time, but did not keep its bead.
@@ -51,11 +53,23 @@ pub struct Ended {
 }
 
 impl Ended {
+    /// A run that a limit of its script ended; `seen`: which one, and where.
+    pub fn stopped(seen: String) -> Self {
+        Self {
+            kind: EndKind::Stopped,
+            refusal: None,
+            reason: None,
+            seen,
+            expected: String::new(),
+            to_do: String::new(),
+        }
+    }
+
     /// Whether it ended as requested.
     pub fn as_asked(&self) -> bool {
         matches!(
             self.kind,
-            EndKind::Done | EndKind::ReferenceOver | EndKind::Operator
+            EndKind::Done | EndKind::ReferenceOver | EndKind::Operator | EndKind::Stopped
         )
     }
 
@@ -203,7 +217,7 @@ impl Clues {
             EndKind::Done => sentences("the time of the run was over", "", ""),
             EndKind::ReferenceOver => sentences("the reference came to its end", "", ""),
             EndKind::NotKept => not_kept(kept, self.clipped_um),
-            EndKind::Operator => sentences("the operator ended the run", "", ""),
+            EndKind::Operator | EndKind::Stopped => sentences("the operator ended the run", "", ""),
             EndKind::Unrecorded => sentences(
                 recorder.map_or("the run was not recorded", RecorderFault::sentence),
                 "a disk that takes the record",

@@ -263,7 +263,12 @@ fn sentence(check: &Check, limits: &CheckLimits) -> (Emphasis, String) {
 fn short(factor: f64) -> String {
     let digits = (1.0 - factor.log10().floor()).clamp(0.0, 4.0) as i32;
     let unit = 10f64.powi(digits);
-    format!("{:.*}", digits as usize, (factor * unit).floor() / unit)
+    // 3.2 as a product of floats is just below it.
+    format!(
+        "{:.*}",
+        digits as usize,
+        (factor * unit * (1.0 + 1e-9)).floor() / unit
+    )
 }
 
 /// A limit with its value.

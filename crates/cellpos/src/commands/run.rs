@@ -37,6 +37,7 @@ use cellpos_session::{Options, Rig, connect};
 use learning::Keeper;
 use over::{Over, Telling};
 use ready::Ready;
+use resume::Next;
 use sink::{ScriptSink, Stalls};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -126,9 +127,9 @@ pub(crate) fn run(args: Args) -> CommandResult {
     }
     let mut ready = match &args.resume {
         Some(folder) => match resume::ready(folder, args.best_effort)? {
-            Some(ready) => ready,
-            None => {
-                print_text("all cycles are done: nothing to resume\n")?;
+            Next::Session(ready) => *ready,
+            Next::Nothing(why) => {
+                print_text(&format!("{why}\n"))?;
                 return Ok(Outcome::Done);
             }
         },

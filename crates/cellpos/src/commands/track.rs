@@ -357,7 +357,7 @@ fn conclude(
         warnings.push(format!("no learned.toml: {error}"));
     }
     let what = match ended.kind {
-        EndKind::Operator => What::Stop,
+        EndKind::Operator | EndKind::Stopped => What::Stop,
         _ if healthy => What::End,
         _ => What::Safe,
     };
@@ -421,10 +421,7 @@ fn text(report: &Report) -> String {
     }
     line(
         "lowest possible",
-        format!(
-            "{} RMS (Brownian motion, loop delay, noise of these fixes)",
-            nm(report.bound_rms_nm)
-        ),
+        connect::possible_text(report.bound_rms_nm),
     );
     if let Some(step) = s.step {
         line(

@@ -214,3 +214,45 @@ fn a_cell_that_does_not_fit_and_a_table_without_a_cell_are_refused_by_name() {
         assert!(words.iter().all(|word| err.contains(word)), "{file}: {err}");
     }
 }
+
+/// A limit of the script ends a run: the run says which one, no person is blamed, and when it is resumed the cell is as tired as it was.
+#[test]
+fn a_tired_cell_stops_its_script_and_is_as_tired_when_it_is_resumed() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let rig = cell_rig().replace("fatigue_passages = 180", "fatigue_passages = 60");
+    std::fs::write(at.join("cell.toml"), rig).unwrap();
+    let script = "name = \"tired\"\n[stop]\nstretch_down = \"8%\"\n[[step]]\ndo = \"repeat\"\ntimes = 40\n\
+                  [[step.step]]\ndo = \"move\"\nto = \"8um\"\nduration = \"200ms\"\n[[step.step]]\ndo = \"hold\"\nduration = \"300ms\"\n\
+                  [[step.step]]\ndo = \"move\"\nto = \"0um\"\nduration = \"200ms\"\n[[step.step]]\ndo = \"hold\"\nduration = \"900ms\"\n";
+    std::fs::write(at.join("tired.toml"), script).unwrap();
+    let simulated = ["--clock", "virtual", "--frames", "off", "--json"];
+    let args = [&["run", "tired.toml", "--rig", "cell.toml"], &simulated[..]].concat();
+    let stopped = |args: &[&str]| {
+        let (code, out, err) = cellpos(at, args);
+        assert_eq!(code, Some(1), "{err}");
+        serde_json::from_str::<serde_json::Value>(&out).expect(&err)
+    };
+    let first = stopped(&args);
+    assert_eq!(first["outcome"], "stopped", "{first}");
+    assert_eq!(first["ended"]["kind"], "stopped", "{first}");
+    let seen = first["ended"]["seen"].as_str().unwrap();
+    assert!(seen.contains("stretch_down"), "{seen}");
+    let run = only_run(at);
+    let report = json(at, &["report", run.to_str().unwrap(), "--json"]);
+    let result = report["result"].as_str().unwrap();
+    assert!(
+        result.contains("stretch_down") && !result.contains("operator"),
+        "{result}"
+    );
+    let before = values(&run, "length_peak_um");
+    let _ = stopped(&["run", "--resume", run.to_str().unwrap(), "--json"]);
+    let after = values(&run, "length_peak_um");
+    let next = after[before.len()];
+    let last = before[before.len() - 1];
+    // A fresh cell would be a fifth longer.
+    assert!(
+        (next / last - 1.0).abs() < 0.03,
+        "{next} um after {last} um"
+    );
+}

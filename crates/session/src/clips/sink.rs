@@ -37,6 +37,11 @@ impl<S> Clipped<S> {
         }
     }
 
+    /// The sink within.
+    pub fn within(&self) -> &S {
+        &self.sink
+    }
+
     /// The sink within, and the clips.
     pub fn into_parts(self) -> (S, Option<Clips>) {
         (self.sink, self.clips)

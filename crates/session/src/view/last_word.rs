@@ -25,7 +25,7 @@ impl Ended {
     pub fn last_word(&self) -> LastWord {
         let how = match self.kind {
             EndKind::Done | EndKind::ReferenceOver => "done",
-            EndKind::Operator => "stopped",
+            EndKind::Operator | EndKind::Stopped => "stopped",
             EndKind::NotKept => "not-kept",
             EndKind::ArmingRefused | EndKind::Safe => "safe",
             EndKind::Unrecorded | EndKind::Failed => "failed",

@@ -22,7 +22,12 @@ impl<S> Viewed<S> {
         Self { sink, page }
     }
 
-    /// The sink within. The page shows the summary's own figures from now on.
+    /// The sink within.
+    pub fn within(&self) -> &S {
+        &self.sink
+    }
+
+    /// The sink within, by itself. The page shows the summary's own figures from now on.
     pub fn into_inner(self, summary: &Summary, ended: &Ended) -> S {
         if let Some((mut watcher, _)) = self.page {
             watcher.conclude(summary, ended);

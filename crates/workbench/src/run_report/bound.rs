@@ -3,7 +3,9 @@
 use super::ticks::Ticks;
 use cellpos_control::design::bound_rms_um;
 use cellpos_record::RunMeta;
+use cellpos_report::{Emphasis, Report};
 use cellpos_runtime::Hold;
+use cellpos_session::connect;
 
 /// What Brownian motion, delay and localisation noise leave to the best controller while holding.
 #[derive(Debug)]
@@ -31,6 +33,31 @@ pub(super) fn hold_of(meta: &RunMeta) -> Option<Hold> {
 }
 
 impl Bound {
+    /// Whether the run held below it by more than chance.
+    pub(super) fn is_beaten(&self, ticks: &Ticks) -> bool {
+        ticks.rms_um().is_some_and(|um| {
+            let reached_um = (um.powi(2) - ticks.noise_um().powi(2)).max(0.0).sqrt();
+            connect::is_beaten(self.rms_um, reached_um, ticks.counted_s())
+        })
+    }
+
+    /// The bound, if it can be one; a note on the page if the run held below it.
+    pub(super) fn unbeaten(self, ticks: &Ticks, page: &mut Report) -> Option<Self> {
+        if !self.is_beaten(ticks) {
+            return Some(self);
+        }
+        page.note(
+            Emphasis::Warning,
+            &format!(
+                "The run held below what its model says is possible, {:.1} nm: the model's diffusion ({:.3} um2/s) or delay is too large. \
+                 Identify the plant again.",
+                1e3 * self.rms_um,
+                self.diffusion_um2_per_s
+            ),
+        );
+        None
+    }
+
     /// The bound of a run, if its run.toml says enough.
     pub(super) fn of(meta: Option<&RunMeta>, ticks: &Ticks) -> Option<Self> {
         let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta?)?;

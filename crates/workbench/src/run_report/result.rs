@@ -55,9 +55,9 @@ pub(super) fn section(
         );
     }
     result.push_str(&match lost {
-        0 => " No frame was lost.".to_string(),
-        1 => " One frame was lost.".to_string(),
-        many => format!(" {many} frames were lost."),
+        0 => " No frame is missing.".to_string(),
+        1 => " One frame is missing.".to_string(),
+        many => format!(" {many} frames are missing."),
     });
     if without > 0 {
         result.push_str(&format!(" {without} frames showed no {what}."));
@@ -125,12 +125,13 @@ fn change(found: &Trend) -> String {
     )
 }
 
+/// The change in percent, or that it is no more than chance.
 fn percent(found: &Trend) -> String {
-    format!(
-        " ({:+.1} %)",
-        100.0 * (found.last.mean / found.first.mean - 1.0)
-    )
-    .replace('-', "\u{2212}")
+    let (first, last) = (&found.first, &found.last);
+    if (last.mean - first.mean).abs() <= first.ci95.hypot(last.ci95) {
+        return " (no more than chance)".to_string();
+    }
+    format!(" ({:+.1} %)", 100.0 * (last.mean / first.mean - 1.0)).replace('-', "\u{2212}")
 }
 
 /// A cell over its cycles.
@@ -140,11 +141,12 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
         return of_few_cycles(rows, &rest);
     };
     let mut text = format!(
-        "The cell's stretch (largest length over the {:.2} um at rest) went {}{} over {} cycles",
+        "The cell's stretch (largest length over the {:.2} um at rest) went {}{} over {} cycles (means of the first and the last {})",
         rest.length_um,
         change(&stretch),
         percent(&stretch),
-        stretch.cycles
+        stretch.cycles,
+        stretch.first.cycles
     );
     if let Some(recovery) = cyclic(rows, |row| row.recovery_s) {
         text.push_str(&format!(

@@ -54,11 +54,15 @@ pub(super) fn conclude(
         sink,
         ..
     } = finished;
+    let script = sink.within().within().end();
+    let ended = match &script.row_stop {
+        Some(stop) if ended.kind == EndKind::Operator => Ended::stopped(stop.seen.clone()),
+        _ => ended,
+    };
     let (sink, kept_clips) = sink.into_inner(&summary, &ended).into_parts();
     // First release the terminal and end the page, then print.
     drop(view);
     warnings.extend(clips::warnings(kept_clips));
-    let script = sink.end();
     let not_kept = ended.kind == EndKind::NotKept;
     let outcome = match (ended.as_asked(), script.complete()) {
         (false, false) if not_kept && script.is_stop() => "stopped",

@@ -124,7 +124,7 @@ impl Queue {
                 return Ok(Some(format!("cell {number}: {}", over.ended)));
             }
             let stop = match over.ended.kind {
-                EndKind::Done | EndKind::ReferenceOver => None,
+                EndKind::Done | EndKind::ReferenceOver | EndKind::Stopped => None,
                 EndKind::Operator if over.outcome != "aborted" => None,
                 // One cell that is lost is one row; a rig that fails would fail every further cell.
                 EndKind::Safe | EndKind::NotKept => None,

@@ -132,8 +132,16 @@ pub(crate) fn cycles_parquet(folder: &Path, rows: &[CycleRow]) -> Result<(), Rec
     write_table_parquet(&folder.join(CYCLES_PARQUET), &columns)
 }
 
-/// The next session of a run; None when nothing is left to do.
-pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, Failure> {
+/// What comes after the sessions of a run.
+pub(crate) enum Next {
+    /// Another session.
+    Session(Box<Ready>),
+    /// Nothing: why.
+    Nothing(String),
+}
+
+/// The next session of a run.
+pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Next, Failure> {
     let not_a_run = |problem: String| {
         Failure::bad_input(
             format!("{}: {problem}", folder.display()),
@@ -176,7 +184,7 @@ pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, F
     let last_done = is_done(last);
     // A script without a recorded end may still have a step after its last cycle.
     if over || last_done {
-        return Ok(None);
+        return Ok(Next::Nothing(nothing_left(done.len(), plan.cycle_count())));
     }
     let ReferenceSpec::Script {
         file: script,
@@ -190,7 +198,7 @@ pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, F
     renew(folder)?;
     let number = sessions.len() as u64 + 1;
     let ran_s = ran_s(&sessions, file.timing.period_us * 1e-6)?;
-    seek_where_it_was(&mut file, &done, last);
+    go_on_from(&mut file, &done, last);
     // Another session sees other noise, and the same each time that it is repeated.
     file.emulator.seed = file.emulator.seed.wrapping_add(number - 1);
     let clock = if meta.clock == "virtual" {
@@ -198,7 +206,7 @@ pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, F
     } else {
         ClockKind::Real
     };
-    Ok(Some(Ready {
+    Ok(Next::Session(Box::new(Ready {
         prepared: Prepared {
             model: setup.model,
             controller: setup.controller,
@@ -231,7 +239,18 @@ pub(crate) fn ready(folder: &Path, best_effort: bool) -> Result<Option<Ready>, F
         inputs: meta.inputs.clone(),
         runs: PathBuf::new(),
         home: Some((folder.to_owned(), folder.join(SESSIONS))),
-    }))
+    })))
+}
+
+/// Why a run has no next session.
+fn nothing_left(done: usize, planned: u64) -> String {
+    match (done as u64) < planned {
+        true => format!(
+            "the script's own [stop] ended this run after {done} of {planned} cycles: nothing to resume; for more cycles begin a new run \
+             with a later stop"
+        ),
+        false => "all cycles are done: nothing to resume".to_owned(),
+    }
 }
 
 /// Outcomes of a script that came to its end.
@@ -245,8 +264,12 @@ fn is_done(session: &Path) -> bool {
     })
 }
 
-/// Has the next session look for the bead where it was.
-fn seek_where_it_was(file: &mut RigFile, done: &[CycleRow], last: &Path) {
+/// Has the next session look for the bead where it was; an emulated cell is as tired as it was.
+fn go_on_from(file: &mut RigFile, done: &[CycleRow], last: &Path) {
+    if let Some(cell) = &mut file.emulator.cell {
+        let passages = done.iter().filter(|row| row.arm == ArmKind::Cyclic).count();
+        cell.passages_before = u32::try_from(passages).unwrap_or(u32::MAX);
+    }
     // Where the bead rested last is a better first belief than the rig file's.
     let rested = done.iter().rev().map(|row| row.neutral_um);
     let within = |um: &f64| (file.limits.low_um..=file.limits.high_um).contains(um);

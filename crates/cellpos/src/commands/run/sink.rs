@@ -38,7 +38,7 @@ pub(super) struct ScriptSink {
     stage: Stage,
     alarms: u64,
     /// Why the rows of the table stopped it.
-    row_stop: Option<&'static str>,
+    row_stop: Option<RowStop>,
     /// Length of the cell at the start of the first cycle, um.
     at_rest: AtRest,
     stretch: Option<f64>,
@@ -56,13 +56,22 @@ pub(super) struct Stalls {
     pub clock: Clock,
 }
 
+/// A limit of the script that the rows of the per-cycle table passed.
+#[derive(Debug, Clone)]
+pub(super) struct RowStop {
+    /// In short.
+    pub name: &'static str,
+    /// What was seen.
+    pub seen: String,
+}
+
 /// How a script came to its end.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct End {
     /// What it was doing last.
     pub stage: Stage,
     /// Why the rows of the per-cycle table stopped it, if they did.
-    pub row_stop: Option<&'static str>,
+    pub row_stop: Option<RowStop>,
     /// Alarms given.
     pub alarms: u64,
 }
@@ -70,7 +79,7 @@ pub(super) struct End {
 impl End {
     /// In words.
     pub(super) fn name(&self) -> &'static str {
-        self.row_stop.unwrap_or_else(|| self.stage.name())
+        (self.row_stop.as_ref()).map_or_else(|| self.stage.name(), |stop| stop.name)
     }
 
     /// Whether a condition of the script stopped it.
@@ -174,7 +183,7 @@ impl ScriptSink {
     pub(super) fn end(&self) -> End {
         End {
             stage: self.stage,
-            row_stop: self.row_stop,
+            row_stop: self.row_stop.clone(),
             alarms: self.alarms,
         }
     }
@@ -245,7 +254,7 @@ impl ScriptSink {
         self.waiting.push(row);
     }
 
-    /// The script's own limit of the amplitude error: the bead is frozen and the run ends, as if the operator asked for it.
+    /// The script's own limit of the amplitude error: the bead is frozen and the run ends.
     fn judge(&mut self, row: &CycleRow, time_s: f64) {
         let Some(Alarm::Raised { error, .. }) =
             self.limit.as_mut().and_then(|limit| limit.add(row))
@@ -256,7 +265,14 @@ impl ScriptSink {
             .with("cycle", row.cycle)
             .with("error_percent", error * 100.0);
         self.writer.event(&event);
-        self.stop("stopped: amplitude error too large");
+        self.stop(
+            "stopped: amplitude error too large",
+            format!(
+                "the script's error_above stopped it in cycle {}: the amplitude error was {:.1} %",
+                row.cycle + 1,
+                error * 100.0
+            ),
+        );
     }
 
     /// The script's limits for the cell.
@@ -273,19 +289,36 @@ impl ScriptSink {
         self.writer.event(&event);
         // Said once: the rows behind it are of a bead that is frozen.
         self.fatigue = None;
-        self.stop(match passed.quantity {
-            "stretch_down" => "stopped: the cell stretches less",
-            "rest_length_change" => "stopped: the cell at rest has another length",
-            _ => "stopped: the cell recovers more slowly",
-        });
+        let (name, of) = match passed.quantity {
+            "stretch_down" => ("stopped: the cell stretches less", "its stretch"),
+            "rest_length_change" => (
+                "stopped: the cell at rest has another length",
+                "its length at rest, um,",
+            ),
+            _ => (
+                "stopped: the cell recovers more slowly",
+                "its recovery time, s,",
+            ),
+        };
+        self.stop(
+            name,
+            format!(
+                "the script's {} stopped it in cycle {}: {of} went from {:.3} to {:.3}; the limit was {:.3}",
+                passed.quantity,
+                row.cycle + 1,
+                passed.first,
+                passed.value,
+                passed.allowed
+            ),
+        );
     }
 
-    fn stop(&mut self, why: &'static str) {
+    fn stop(&mut self, name: &'static str, seen: String) {
         if !matches!(self.operator.asked(), Request::Freeze | Request::Park) {
-            self.row_stop = Some(why);
             let time_s = self.last.map_or(0.0, |r| r.time_ns as f64 * 1e-9);
             self.unshown
-                .line(time_s, "fault", format!("The script is {why}."));
+                .line(time_s, "fault", format!("The script is {name}."));
+            self.row_stop = Some(RowStop { name, seen });
             self.operator.ask(Request::Freeze);
         }
     }

@@ -6,6 +6,7 @@ use crate::kept;
 use cellpos_runtime::Summary;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_script::CycleRow;
+use cellpos_session::connect;
 use cellpos_session::{Ended, adapt};
 use serde::Serialize;
 
@@ -131,7 +132,7 @@ impl<'a> Report<'a> {
         );
         line("error, all", kept::error(&self.summary.kept));
         line("held", kept::held(&self.summary.kept));
-        line("lowest possible", or_dash(self.bound_rms_nm, "nm RMS"));
+        line("lowest possible", connect::possible_text(self.bound_rms_nm));
         if let Some(now) = &self.summary.adaptation {
             line("adaptation", adapt::text(now));
         }

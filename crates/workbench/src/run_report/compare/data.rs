@@ -154,8 +154,10 @@ impl Compared {
             rms_nm: ticks.rms_um().map(nm),
             rms_ci95_nm: ticks.rms_ci95_um().map(nm),
             bound_rms_nm: (!ticks.target_moves)
-                .then(|| Bound::of(meta, ticks).map(|bound| nm(bound.rms_um)))
-                .flatten(),
+                .then(|| Bound::of(meta, ticks))
+                .flatten()
+                .filter(|bound| !bound.is_beaten(ticks))
+                .map(|bound| nm(bound.rms_um)),
             ends,
             emphasis,
             task: meta.map_or_else(String::new, |meta| {
