@@ -1,7 +1,7 @@
 //! The belief in gain and delay: for each delay a mixture of normal distributions of the gain.
 //!
-//! The gain walks a little, and either or both may change to anything that a plant can have, once in a long time. When the last change
-//! came is not known. There is one distribution for each of some spans of time in which it may have come, and each fix tells which of them
+//! The gain walks a little, and either or both may change to anything that a plant can have, once in a long time. The gain may as well move
+//! there by and by: it walks far for some time, and settles. When the last change came is not known. There is one distribution for each of some spans of time in which it may have come, and each fix tells which of them
 //! explains it best (change-point detection by Bayes). So a change is found as soon as it explains the fixes better than chance does at the
 //! stated rate of changes, and there is no search that could raise a false alarm.
 
@@ -16,7 +16,7 @@ pub(super) const DELAYS: usize = ((LAGS[MEMBERS - 1] - LAGS[0]) / STEP) as usize
 /// within half a standard deviation of the estimate. A gain that does not drift is inside for 99 % in the long run, whatever the walk
 /// is: the drift is half of the stated variance.
 const GAIN_WALK: f64 = 0.008;
-/// Changes of each kind (gain, delay, both) in a second: one an hour.
+/// Changes of each kind (gain at once, gain by and by, delay, gain and delay) in a second: one an hour.
 const CHANGES_PER_S: f64 = 1.0 / 3600.0;
 /// Standard deviation of the logarithm of a gain that is not known: twice and half the model's are usual.
 const GAIN_PRIOR: f64 = LN_2;
@@ -25,6 +25,10 @@ const DELAY_PRIOR: f64 = 2.0;
 /// Spans of time in which the last change may have come. Neighbours that are least likely become one. With 5 or 16 of them the
 /// loop holds the same.
 const SPANS: usize = 8;
+/// Time that a change takes which is no jump, s. The gain walks as far as one that is not known meanwhile.
+const MOVES_S: f64 = 20.0;
+/// The span in which the gain moves; the others are by age, the oldest first.
+const MOVING: usize = 0;
 
 /// A delay of the belief beyond the design's, samples.
 pub(super) fn delay_at(d: usize) -> f64 {
@@ -129,7 +133,7 @@ type Span = [Part; DELAYS];
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Belief {
     prior: [f64; DELAYS],
-    /// The oldest first.
+    /// That of [`MOVING`], then the oldest first.
     spans: [Span; SPANS],
 }
 
@@ -143,7 +147,7 @@ impl Belief {
         let all: f64 = (0..DELAYS).map(weight).sum();
         let prior = std::array::from_fn(|d| weight(d) / all);
         let mut spans = [[Part::default(); DELAYS]; SPANS];
-        spans[0] = prior.map(Part::unknown);
+        spans[1] = prior.map(Part::unknown);
         Self { prior, spans }
     }
 
@@ -155,8 +159,8 @@ impl Belief {
     fn merge(&mut self) {
         let of = |span: &Span| -> f64 { span.iter().map(|part| part.probability).sum() };
         let both = |k: &usize| of(&self.spans[*k]) + of(&self.spans[*k + 1]);
-        let least = (0..SPANS - 1).min_by(|a, b| both(a).total_cmp(&both(b)));
-        let k = least.unwrap_or(0);
+        let least = (1..SPANS - 1).min_by(|a, b| both(a).total_cmp(&both(b)));
+        let k = least.unwrap_or(1);
         let [one, other] = [self.spans[k], self.spans[k + 1]];
         self.spans[k] = std::array::from_fn(|d| Part::sum([one[d], other[d]].into_iter()));
         self.spans.copy_within(k + 2.., k + 1);
@@ -165,19 +169,28 @@ impl Belief {
     /// The plant some time later.
     fn onward(&mut self, seconds: f64) {
         let change = CHANGES_PER_S * seconds;
+        let settles = seconds / MOVES_S;
         let prior = self.prior;
-        let changed =
-            std::array::from_fn(|d| Part::unknown(change * (self.delay(d).probability + prior[d])));
-        self.merge();
-        for span in &mut self.spans[..SPANS - 1] {
+        let all: Span = std::array::from_fn(|d| self.delay(d));
+        let unknown = |d: usize| Part::unknown(change * (all[d].probability + prior[d]));
+        let settled = self.spans[MOVING].map(|part| part.times(settles));
+        for new in [settled, std::array::from_fn(unknown)] {
+            self.merge();
+            self.spans[SPANS - 1] = new;
+        }
+        for (k, span) in self.spans[..SPANS - 2].iter_mut().enumerate() {
             let any = Part::sum(span.iter().copied());
-            for (part, prior) in span.iter_mut().zip(prior) {
-                let same = part.times(1.0 - 3.0 * change);
-                *part = Part::sum([same, any.times(change * prior)].into_iter());
-                part.variance += (GAIN_WALK * part.gain).powi(2) * seconds;
+            let (begins, ends, walk) = match k {
+                MOVING => (change, settles, GAIN_PRIOR / MOVES_S.sqrt()),
+                _ => (0.0, change, GAIN_WALK),
+            };
+            for ((part, all), prior) in span.iter_mut().zip(all).zip(prior) {
+                let same = part.times(1.0 - 3.0 * change - ends);
+                let others = [all.times(begins), any.times(change * prior)];
+                *part = Part::sum(std::iter::once(same).chain(others));
+                part.variance += (walk * part.gain).powi(2) * seconds;
             }
         }
-        self.spans[SPANS - 1] = changed;
     }
 
     /// A block of fixes over this time, as each delay explains it. What is known then.

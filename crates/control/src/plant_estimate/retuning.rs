@@ -31,8 +31,9 @@ pub(super) const TUNINGS: usize = 6;
 pub(super) const NOMINAL: usize = 2;
 /// Gains, over the design's, that the law is tuned to.
 const GAINS: [f64; 2] = [0.4, 2.5];
-/// Largest change per tick of the logarithm of the gain in force downwards: half the gain is in force 0.7 s after it is known at 1 kHz.
-const DOWN_PER_TICK: f64 = 0.001;
+/// Largest change per tick of the logarithm of the gain in force downwards: something that holds the bead is known by its stillness after
+/// some 200 ticks, and the gain in force has changed by 10 % then. Half the gain is in force 1.4 s after it is known at 1 kHz.
+const DOWN_PER_TICK: f64 = 0.0005;
 /// Standard deviations of a 95 % interval. A tuning outside of it follows the estimate at once.
 const INTERVAL: f64 = 1.96;
 /// Ticks in which a tuning inside of it settles at the estimate: longer than a belief in a change that the next blocks refute, less than

@@ -60,6 +60,16 @@ fn gain_and_delay_that_step_or_drift_are_followed_with_hold_error_and_margins_as
     }
 }
 
+/// An order in which the estimate lagged by eight of its standard deviations, and the law was too bold.
+#[test]
+fn a_change_after_a_drift_is_followed_before_the_law_is_too_bold() {
+    let rows = hold_through(adapting(lqg()), RigConfig::eq6(5006), &regimes(5006));
+    for (regime, row) in regimes(5006).iter().zip(rows) {
+        let good = row.over_bound < 1.2 && row.ms < 2.0;
+        assert!(good, "{regime:?}: {row:?}");
+    }
+}
+
 #[test]
 #[ignore = "long: run with --release -- --include-ignored"]
 fn every_gain_and_delay_of_the_spread_in_ten_orders_is_followed() {
