@@ -47,6 +47,27 @@ def rendered(snr, frames=60, size=200, edge=6.4):
     return pictures, truth
 
 
+def spots(frames=20, size=512, count=600, sigma=1.5, snr=20):
+    """Frames of Gaussian spots in a grid, each moved by up to 4 px, and their places."""
+    rng = np.random.default_rng(2)
+    side = int(np.ceil(np.sqrt(count)))
+    pitch = size / side
+    pictures, truth = [], []
+    for _ in range(frames):
+        grey = np.full((size, size), 60.0)
+        places = []
+        for k in range(count):
+            px, py = pitch * (np.array([k % side, k // side]) + 0.5) + rng.uniform(-4, 4, 2) - 0.5
+            i, j = int(px) - 8, int(py) - 8
+            x, y = np.meshgrid(np.arange(max(i, 0), min(i + 17, size)), np.arange(max(j, 0), min(j + 17, size)))
+            grey[y, x] += 100 * np.exp(-((x - px) ** 2 + (y - py) ** 2) / (2 * sigma**2))
+            places.append((px, py))
+        grey += 100 / snr * rng.standard_normal(grey.shape)
+        pictures.append(np.clip(np.round(grey), 0, 255).astype(np.uint8))
+        truth.append(places)
+    return pictures, truth
+
+
 def read(folder):
     paths = sorted(p for p in pathlib.Path(folder).iterdir() if p.suffix in (".png", ".tif"))
     pictures = [np.asarray(Image.open(p)) for p in paths]
@@ -147,6 +168,13 @@ def main():
         ):
             recall, error, extra = against(truth, found)
             print(f"| rendered, SNR {snr} | {name} | {recall:.3f} | {error:.4f} | {extra} | {ms:.2f} |")
+    pictures, truth = spots()
+    for name, (found, ms) in (
+        ("cellpos vision", by_cellpos(args.cellpos, pictures)),
+        ("trackpy 9 px", by_trackpy(pictures, 9, 400, False)),
+    ):
+        recall, error, extra = against(truth, found)
+        print(f"| 600 spots of 1.5 px, SNR 20 | {name} | {recall:.3f} | {error:.4f} | {extra} | {ms:.2f} |")
     data = pathlib.Path(args.data)
     for label, name, tracks, diameter, minmass, invert in (
         ("beads-brightfield", "beads-brightfield", lambda f: template_fits(f / "reference.csv"), 21, 2000, False),
