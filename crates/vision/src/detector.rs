@@ -1,6 +1,7 @@
 //! Finds every bead of a frame by threshold above the background about it: seeds for [`crate::Localiser::locate`].
 
 use crate::blobs::{Blob, Blobs, WIDEST};
+use crate::fix::squared;
 use crate::frame::{Frame, Pixels};
 use crate::level::Level;
 use crate::localiser::Localiser;
@@ -184,7 +185,7 @@ impl Detector {
             // Of a stronger one this look shows more, or the ring about it.
             let holds = |b: &Blob| {
                 let inside = (left..=right).contains(&b.x_px) && (top..=bottom).contains(&b.y_px);
-                inside || f64::hypot(b.x_px - blob.x_px, b.y_px - blob.y_px) < own_px
+                inside || squared(b.x_px - blob.x_px, b.y_px - blob.y_px) < own_px * own_px
             };
             let seen = self.found.iter().take(known).any(holds);
             if blob.area_px <= SPECK_AREA_PX {

@@ -62,3 +62,8 @@ impl Fix {
         }
     }
 }
+
+/// Square of a distance. Each bead is compared with each other one: a root, or `hypot`, would be most of the time of many beads.
+pub(crate) fn squared(dx: f64, dy: f64) -> f64 {
+    dx * dx + dy * dy
+}

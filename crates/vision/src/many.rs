@@ -5,7 +5,7 @@
 //! knowingly.
 
 use crate::detector::Detector;
-use crate::fix::{Fix, FixQuality};
+use crate::fix::{Fix, FixQuality, squared};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 
@@ -100,11 +100,12 @@ impl ManyTracker {
         self.localiser.locate_all(frame, places, &mut fixes);
         let mut pairs: Vec<(f64, usize, usize)> = Vec::new();
         for (t, track) in self.tracks.iter().enumerate() {
+            // The longer a bead was missed, the farther it may have gone.
+            let most_px2 = self.config.max_step_px.powi(2) * f64::from(1 + track.missed);
             for (f, fix) in fixes.iter().enumerate() {
-                let step_px = f64::hypot(fix.x_px - track.x_px, fix.y_px - track.y_px);
-                // The longer a bead was missed, the farther it may have gone.
-                if step_px <= self.config.max_step_px * f64::from(1 + track.missed).sqrt() {
-                    pairs.push((step_px, t, f));
+                let step_px2 = squared(fix.x_px - track.x_px, fix.y_px - track.y_px);
+                if step_px2 <= most_px2 {
+                    pairs.push((step_px2, t, f));
                 }
             }
         }

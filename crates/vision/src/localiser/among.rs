@@ -5,7 +5,7 @@
 use super::Localiser;
 use super::view::{Others, View};
 use crate::fit::Image;
-use crate::fix::{Fix, FixQuality};
+use crate::fix::{Fix, FixQuality, squared};
 use crate::frame::Frame;
 use crate::streak::Comb;
 use crate::template::Template;
@@ -34,13 +34,14 @@ impl Localiser {
             let alone = places
                 .clone()
                 .enumerate()
-                .all(|(m, (u, v))| m == n || f64::hypot(u - x, v - y) > reach_px);
+                .all(|(m, (u, v))| m == n || squared(u - x, v - y) > reach_px * reach_px);
             let view = View {
                 is_draft: !alone,
                 ..View::of(frame)
             };
             let fix = self.locate_in(&view, (x, y));
-            let apart = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) >= radius_px;
+            let apart =
+                |f: &Fix| squared(f.x_px - fix.x_px, f.y_px - fix.y_px) >= radius_px * radius_px;
             if fixes.iter().all(apart) {
                 fixes.push(fix);
                 drafted.push(!alone);
@@ -50,8 +51,8 @@ impl Localiser {
             for k in 0..fixes.len() {
                 let own = fixes[k];
                 let near = |f: &Fix| {
-                    let off_px = f64::hypot(f.x_px - own.x_px, f.y_px - own.y_px);
-                    off_px > 0.0 && off_px <= reach_px
+                    let off_px2 = squared(f.x_px - own.x_px, f.y_px - own.y_px);
+                    off_px2 > 0.0 && off_px2 <= reach_px * reach_px
                 };
                 // Two beads may be a bad fit because of each other; what is much weaker is none.
                 let is_bead = |f: &&Fix| {
@@ -83,7 +84,8 @@ impl Localiser {
         let mut kept = 0;
         for k in 0..fixes.len() {
             let fix = fixes[k];
-            let same = |f: &Fix| f64::hypot(f.x_px - fix.x_px, f.y_px - fix.y_px) < radius_px;
+            let same =
+                |f: &Fix| squared(f.x_px - fix.x_px, f.y_px - fix.y_px) < radius_px * radius_px;
             if !fixes[..kept].iter().any(same) {
                 fixes[kept] = fix;
                 kept += 1;
