@@ -1,12 +1,13 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
+use crate::data::flow_estimate;
 use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
 use crate::data::waits::waits;
 use crate::dot::dot;
-use crate::simulate::{Base, Sampling, simulate};
+use crate::simulate::{Base, Input, Sampling, simulate};
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 use std::sync::Arc;
@@ -57,6 +58,8 @@ pub(crate) struct Prepared {
     drifts: bool,
     /// Transients and paths in the space of innovations.
     free: Free,
+    /// Where the zero flow was, as the displacement of the PZT that does the same \[um\]; empty: where the working point is.
+    pub flow_um: Vec<f64>,
 }
 
 impl Prepared {
@@ -166,7 +169,7 @@ fn flow_paths(base: &Base, rows: usize) -> FlowPaths {
     let mut off = Vec::new();
     simulate(
         base,
-        (&vec![1.0; rows], &Sampling::default()),
+        Input::new(&vec![1.0; rows], &Sampling::default()),
         &[],
         &mut off,
         None,
@@ -243,6 +246,7 @@ impl Problem {
                     flow,
                     drifts: false,
                     free: Free::default(),
+                    flow_um: Vec::new(),
                     name: r.name.clone(),
                     u,
                     y,
@@ -284,6 +288,18 @@ impl Problem {
         self.noise = noise;
         for r in &mut self.records {
             r.set_noise(&noise);
+        }
+        self
+    }
+
+    /// The same problem with the zero flow where the residuals of a fit say that it was.
+    pub(crate) fn with_flow(mut self, residuals: &[Vec<f64>]) -> Self {
+        let per_um = self.base.speed_per_um() * self.base.sample_s;
+        let off = self.base.free_working_point;
+        for (r, residual) in self.records.iter_mut().zip(residuals) {
+            let by = (&r.whitener, &r.free);
+            r.flow_um = flow_estimate::motion_um(&self.noise, by, &r.flow, off, residual);
+            r.flow_um.iter_mut().for_each(|m| *m /= per_um);
         }
         self
     }

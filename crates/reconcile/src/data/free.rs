@@ -8,6 +8,8 @@ use crate::dot::dot;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Free {
     directions: Vec<(Vec<f64>, f64)>,
+    /// Size of the first of them.
+    first_size: f64,
     log_determinant: f64,
 }
 
@@ -21,7 +23,10 @@ impl Free {
     ) -> Self {
         let mut free = Self::default();
         for t in transients {
-            if let Some((q, _)) = free.direction(whitener, t) {
+            if let Some((q, size)) = free.direction(whitener, t) {
+                if free.directions.is_empty() {
+                    free.first_size = size;
+                }
                 free.directions.push((q, 1.0));
             }
         }
@@ -59,6 +64,20 @@ impl Free {
         let size = left.sqrt();
         w.iter_mut().for_each(|w| *w /= size);
         Some((w, size))
+    }
+
+    /// Multiplies innovations by the inverse of their covariance with the free motions in it.
+    pub(crate) fn weigh(&self, e: &mut [f64]) {
+        for (q, part) in &self.directions {
+            let share = part * (2.0 - part) * dot(q, e);
+            e.iter_mut().zip(q).for_each(|(e, q)| *e -= share * q);
+        }
+    }
+
+    /// How much of the first motion innovations hold.
+    pub(crate) fn size_of_first(&self, e: &[f64]) -> f64 {
+        let of = |(q, _): &(Vec<f64>, f64)| dot(q, e) / self.first_size;
+        self.directions.first().map_or(0.0, of)
     }
 
     /// Removes the free motions from innovations.

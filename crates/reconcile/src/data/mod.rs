@@ -3,6 +3,7 @@
 pub(crate) mod actuator;
 pub(crate) mod coloured;
 pub(crate) mod floor;
+pub(crate) mod flow_estimate;
 pub(crate) mod frames;
 pub(crate) mod free;
 pub(crate) mod motion;

@@ -14,7 +14,7 @@ pub struct ZeroFlow {
 
 impl ZeroFlow {
     /// What is left of a velocity a row later.
-    pub(super) fn keep(&self) -> f64 {
+    pub(crate) fn keep(&self) -> f64 {
         (-1.0 / self.time_rows).exp()
     }
 

@@ -2,7 +2,7 @@
 //! of effects holds them together.
 
 use super::catalogue::{Variant, variants};
-use crate::simulate::{Base, Sampling, simulate};
+use crate::simulate::{Base, Input, Sampling, simulate};
 use cellpos_plant::effects::{self, Action, Definition, Scope};
 use cellpos_plant::{Model, SimulateOptions, Zpk};
 
@@ -38,6 +38,11 @@ const SCOPE: Scope = Scope {
 };
 
 fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
+    carried(model, pzt_um, &[])
+}
+
+/// With what flows beside the displacement.
+fn carried(model: &Model, pzt_um: &[f64], flow_um: &[f64]) -> Vec<f64> {
     let base = Base {
         zpk: Zpk::of(&model.plant),
         working_point_um: 4.0,
@@ -48,13 +53,12 @@ fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
     };
     let u: Vec<f64> = pzt_um.iter().map(|v| v - 4.0).collect();
     let mut y = Vec::new();
-    simulate(
-        &base,
-        (&u, &Sampling::default()),
-        &model.effects,
-        &mut y,
-        None,
-    );
+    let sampling = Sampling::default();
+    let input = Input {
+        flow_um,
+        ..Input::new(&u, &sampling)
+    };
+    simulate(&base, input, &model.effects, &mut y, None);
     y
 }
 
@@ -208,6 +212,39 @@ fn the_two_agree_on_effects_of_a_user_s_own_at_every_place() {
             let off: Vec<f64> = y[..4].iter().map(|y| (y - shown).abs()).collect();
             assert!(off.iter().all(|off| *off < 0.02), "{model:?}: {off:?}");
         }
+    }
+}
+
+#[test]
+fn what_a_bead_does_of_its_own_it_does_with_the_flow_that_carries_it() {
+    let u = command_um();
+    // 0.2 um beside the command: 80 um/s, more than makes the bead stick.
+    let flow_um = vec![0.2; ROWS];
+    let of_flow = predicted(&Model::eq6(), &vec![4.2; ROWS]);
+    for effect in [
+        effects::wall_adhesion(40.0),
+        effects::gain_drift(-0.05),
+        effects::valve_asymmetry(0.05),
+    ] {
+        let model = Model::eq6().with_effect(effect);
+        let mut chain = cellpos_plant::Chain::new(&model).unwrap_or_else(|e| panic!("{e}"));
+        chain.set_beside_um(0.2);
+        let truth: Vec<f64> = (u.iter())
+            .map(|u| {
+                let at = chain.bead_um();
+                chain.advance(*u, 1e-3);
+                at
+            })
+            .collect();
+        // What the plant alone makes of the flow is left to the noise.
+        let whole: Vec<f64> = (carried(&model, &u, &flow_um).iter().zip(&of_flow))
+            .map(|(y, flow)| y + flow)
+            .collect();
+        let (with, without) = (
+            apart_um(&whole, &truth),
+            apart_um(&predicted(&model, &u), &truth),
+        );
+        assert!(with < 0.01 && without > 1.0, "{model:?}: {with} {without}");
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::position_error::Locking;
 use crate::problem::{Mask, Prepared, Problem};
-use crate::simulate::{Base, Effect, Place, simulate};
+use crate::simulate::{Base, Effect, Input, Place, simulate};
 use crate::units::Scales;
 use cellpos_plant::effects::{Action, Candidate, Role, Scope, find};
 use nalgebra::DMatrix;
@@ -194,15 +194,19 @@ impl Context<'_> {
         edge: Option<&mut Vec<f64>>,
     ) {
         let base = &self.problem.base;
+        let input = |u| Input {
+            flow_um: &record.flow_um,
+            ..Input::new(u, &record.sampling)
+        };
         let work = if offset_um == 0.0 {
-            simulate(base, (&record.u, &record.sampling), effects, y, edge)
+            simulate(base, input(&record.u), effects, y, edge)
         } else {
             let base = Base {
                 working_point_um: base.working_point_um + offset_um,
                 ..base.clone()
             };
             let u: Vec<f64> = record.u.iter().map(|u| u - offset_um).collect();
-            simulate(&base, (&u, &record.sampling), effects, y, edge)
+            simulate(&base, input(&u), effects, y, edge)
         };
         self.problem.spend(work);
     }

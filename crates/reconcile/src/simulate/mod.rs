@@ -6,12 +6,15 @@
 //! about a millisecond.
 
 mod camera;
+mod input;
 mod modal;
 
 pub(crate) use camera::{Sampling, near_whole};
 use cellpos_plant::TiedPlant;
 use cellpos_plant::effects::{Action, Around, Block, Piece, Shown};
 pub(crate) use cellpos_plant::{Effect, Place, Zpk};
+pub(crate) use input::Input;
+use input::{interpolate, middle, slew};
 use modal::{Modal, Trace, has_fast_pole};
 
 /// The plant and the sampling that all records of a problem share.
@@ -48,17 +51,18 @@ impl Base {
 /// Returns how much work it was, in the advances of one mode by one step, or as much: known beforehand, the same on every machine.
 pub(crate) fn simulate(
     base: &Base,
-    (u, sampling): (&[f64], &Sampling),
+    input: Input<'_>,
     effects: &[Effect],
     y: &mut Vec<f64>,
     edge: Option<&mut Vec<f64>>,
 ) -> u64 {
     // What is not known to have rested before its record is no loop's record: nobody knows its frames.
-    let sampling = match base.free_start {
-        true => &Sampling::default(),
-        false => sampling,
+    let Input { u, flow_um, .. } = input;
+    let (sampling, flow_um) = match base.free_start {
+        true => (&Sampling::default(), &[][..]),
+        false => (input.sampling, flow_um),
     };
-    let chain = Chain::new(base, sampling, effects);
+    let chain = Chain::new(base, (sampling, flow_um), effects);
     let work = u.len() as u64 * chain.work_per_row();
     let late = (chain.frames.delay_s / base.sample_s).ceil();
     if !base.free_start || late < 1.0 || u.is_empty() {
@@ -109,6 +113,7 @@ struct Frames {
 struct Chain<'a> {
     base: &'a Base,
     sampling: &'a Sampling,
+    flow_um: &'a [f64],
     before: Vec<Stage>,
     /// Plant and linear blocks behind it.
     plant: Zpk,
@@ -124,10 +129,15 @@ struct Chain<'a> {
 }
 
 impl<'a> Chain<'a> {
-    fn new(base: &'a Base, sampling: &'a Sampling, effects: &[Effect]) -> Self {
+    fn new(
+        base: &'a Base,
+        (sampling, flow_um): (&'a Sampling, &'a [f64]),
+        effects: &[Effect],
+    ) -> Self {
         let mut chain = Self {
             base,
             sampling,
+            flow_um,
             before: Vec::new(),
             plant: base.zpk.clone(),
             motion: Vec::new(),
@@ -284,8 +294,22 @@ impl<'a> Chain<'a> {
         if self.base.interpolated_input {
             t.straighten(h);
         }
+        let carried = self.carried(h);
+        t.add(&carried, 1.0);
         self.behind_plant(&mut t, &x, &pending, h);
+        t.add(&carried, -1.0);
         camera::sample(&t, (f, self.sampling), h, self.fine, n, y);
+    }
+
+    /// Where what flows beside the displacement carries the bead through a plant on whose motion blocks act.
+    fn carried(&self, h: f64) -> Trace {
+        let mut t = Trace::default();
+        if !self.motion.is_empty() && !self.flow_um.is_empty() {
+            let held = |&f| std::iter::repeat_n(f, self.fine);
+            let fine: Vec<f64> = self.flow_um.iter().flat_map(held).collect();
+            Modal::new(&self.plant, h).trace(&fine, self.fine, &mut t);
+        }
+        t
     }
 
     /// Whether a delay is all that lies between plant and record: it is exact without a fine grid.
@@ -418,7 +442,7 @@ impl<'a> Chain<'a> {
             if self.base.interpolated_input {
                 beside.straighten(h);
             }
-            t.add(&beside);
+            t.add(&beside, 1.0);
         }
     }
 
@@ -447,50 +471,4 @@ impl<'a> Chain<'a> {
             *edge = share * (x[j] - before);
         }
     }
-}
-
-/// Rate limit; each step holds the mean of the ramp over the step, so that its integral is exact.
-fn slew(x: &mut [f64], rate: f64, h: f64) {
-    let most = rate * h;
-    let mut at = 0.0f64;
-    for v in x.iter_mut() {
-        let d = (*v - at).clamp(-most, most);
-        let share = if most > 0.0 { d.abs() / most } else { 0.0 };
-        // The ramp takes `share` of the step, then rests at its end.
-        *v = at + d * (1.0 - 0.5 * share);
-        at += d;
-    }
-}
-
-/// The mean over each step of a line through the values at the steps' ends: what a plant without a direct path answers to.
-fn middle(x: &mut [f64]) {
-    let mut before = x.first().copied().unwrap_or(0.0);
-    for v in x.iter_mut() {
-        (before, *v) = (*v, 0.5 * (before + *v));
-    }
-}
-
-/// Between the samples, straight lines, or (`smooth`) cubics whose slope at a sample is that of its neighbours, which take far
-/// less from the fast part of an analogue input; each step of the grid holds the value at its end, so that a plant without dynamics
-/// is exact at the samples.
-fn interpolate(u: &[f64], fine: usize, smooth: bool) -> Vec<f64> {
-    let mut x = Vec::with_capacity(u.len() * fine);
-    for k in 0..u.len() {
-        let next = u.get(k + 1).copied().unwrap_or(u[k]);
-        for i in 0..fine {
-            let f = (i as f64 + 1.0) / fine as f64;
-            let line = u[k] + f * (next - u[k]);
-            x.push(if smooth {
-                let before = u[k.saturating_sub(1)];
-                let after = u.get(k + 2).copied().unwrap_or(next);
-                // The cubic through both samples with half the neighbours' difference as slope, less the line.
-                let (a, b) = (0.5 * (next - before), 0.5 * (after - u[k]));
-                let d = next - u[k];
-                line + f * (1.0 - f) * ((1.0 - f) * (a - d) - f * (b - d))
-            } else {
-                line
-            });
-        }
-    }
-    x
 }

@@ -130,9 +130,10 @@ impl Trace {
         }
     }
 
-    /// Adds another motion.
-    pub(super) fn add(&mut self, other: &Self) {
-        let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+    /// Adds another motion times a factor.
+    pub(super) fn add(&mut self, other: &Self, factor: f64) {
+        let add =
+            |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += factor * b);
         add(&mut self.pos, &other.pos);
         add(&mut self.jump, &other.jump);
         add(&mut self.start_slope, &other.start_slope);

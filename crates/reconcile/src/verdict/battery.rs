@@ -6,7 +6,7 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::{Mask, split_in_time};
 use crate::search::lines::{strongest_line, without_line};
-use crate::simulate::simulate;
+use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
 use crate::units::Side;
 use nalgebra::{DMatrix, DVector};
@@ -217,7 +217,13 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
                     let raw: Vec<f64> = rows.iter().map(formula).collect();
                     let moved = if place == "input" {
                         let mut y = Vec::new();
-                        simulate(&ctx.problem.base, (&raw, &r.sampling), &[], &mut y, None);
+                        simulate(
+                            &ctx.problem.base,
+                            Input::new(&raw, &r.sampling),
+                            &[],
+                            &mut y,
+                            None,
+                        );
                         y
                     } else {
                         // A loop has set a row's command by its position: what shows at the output is that of the row before.
@@ -308,7 +314,13 @@ fn straight(ctx: &Context<'_>, library: &[Column], mask: &Mask) -> Vec<Vec<Vec<f
     }
     let gain = ctx.problem.records.iter().map(|r| {
         let (mut y, mut w) = (Vec::new(), vec![0.0; r.u.len()]);
-        simulate(&ctx.problem.base, (&r.u, &r.sampling), &[], &mut y, None);
+        simulate(
+            &ctx.problem.base,
+            Input::new(&r.u, &r.sampling),
+            &[],
+            &mut y,
+            None,
+        );
         r.whiten(&y, &mut w);
         w
     });

@@ -12,7 +12,7 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Columns;
 use crate::search::cost::{left_over, prior_penalty};
 use crate::search::sequential::Found;
-use crate::simulate::simulate;
+use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
@@ -243,7 +243,13 @@ fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
                     let at = low + knot * (high - low);
                     let bent: Vec<f64> = r.u.iter().map(|u| (u - at).max(0.0)).collect();
                     let mut y = Vec::new();
-                    simulate(&ctx.problem.base, (&bent, &r.sampling), &[], &mut y, None);
+                    simulate(
+                        &ctx.problem.base,
+                        Input::new(&bent, &r.sampling),
+                        &[],
+                        &mut y,
+                        None,
+                    );
                     r.whitened(&y)
                 })
                 .collect()

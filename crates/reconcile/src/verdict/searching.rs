@@ -16,6 +16,9 @@ use crate::verdict::held_out;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
+/// In twice the log-likelihood: another estimate of the zero flow changes nothing that decides.
+const SETTLED: f64 = 1.0;
+
 /// What every search of a reconciliation shares.
 pub(super) struct Searching<'a> {
     pub model: &'a Model,
@@ -101,8 +104,6 @@ impl Searching<'_> {
         effort: Effort,
         progress: &mut dyn FnMut(&str),
     ) -> Searched {
-        /// Another estimate of the zero flow changes nothing that decides.
-        const SETTLED: f64 = 1.0;
         const MOST_ROUNDS: usize = 3;
         let base = &problem.base;
         let rests =
@@ -121,8 +122,13 @@ impl Searching<'_> {
             if weighed.cost > self.cost(&moving.problem, &moving.found.fit) - SETTLED {
                 break;
             }
-            let problem = moving.problem.with_noise(weighed.noise);
-            moving = self.search(problem, floor, effort, Some(weighed.fit), &mut *progress);
+            moving = self.search(
+                weighed.problem,
+                floor,
+                effort,
+                Some(weighed.fit),
+                &mut *progress,
+            );
         }
         progress("looking further without a zero flow that moves");
         let noise = NoiseModel {
@@ -146,19 +152,32 @@ impl Searching<'_> {
         }
     }
 
-    /// A set fitted again with the most probable zero flow of its residuals.
+    /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
-        let (residual, _) = self.context(problem, 0).residual(fit);
-        let noise = prior_of(problem).estimate(&problem.noise, |noise| {
-            problem.unlikelihood(noise, &residual)
-        });
-        let problem = problem.clone().with_noise(noise);
-        let fit = self.context(&problem, 0).refit(fit, &problem.all(), 8);
-        Weighed {
-            noise,
-            cost: self.cost(&problem, &fit),
-            fit,
+        /// A path gains half of what the one before it did.
+        const MOST_PATHS: usize = 12;
+        let residual = |problem: &Problem, fit: &Fit| self.context(problem, 0).residual(fit).0;
+        let weighed = |problem: Problem, fit: &Fit| {
+            let fit = self.context(&problem, 0).refit(fit, &problem.all(), 8);
+            Weighed {
+                cost: self.cost(&problem, &fit),
+                problem,
+                fit,
+            }
+        };
+        let left = residual(problem, fit);
+        let noise =
+            prior_of(problem).estimate(&problem.noise, |noise| problem.unlikelihood(noise, &left));
+        let mut best = weighed(problem.clone().with_noise(noise), fit);
+        for _ in 0..MOST_PATHS {
+            let left = residual(&best.problem, &best.fit);
+            let next = weighed(best.problem.clone().with_flow(&left), &best.fit);
+            if next.cost > best.cost - SETTLED {
+                break;
+            }
+            best = next;
         }
+        best
     }
 
     /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the zero flow and, for each part,
@@ -183,9 +202,9 @@ fn prior_of(problem: &Problem) -> Prior {
     Prior::new(problem.base.speed_per_um(), problem.base.sample_s)
 }
 
-/// A set with its noise, and their joint cost.
+/// A set with the noise that it leaves, and their joint cost.
 struct Weighed {
-    noise: NoiseModel,
+    problem: Problem,
     fit: Fit,
     cost: f64,
 }

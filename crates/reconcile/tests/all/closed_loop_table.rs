@@ -69,6 +69,13 @@ fn a_leak_is_named_although_the_command_runs_away_with_the_drift_of_the_zero_flo
 }
 
 #[test]
+fn a_bead_that_sticks_does_so_in_the_flow_and_nothing_is_named_beside_it() {
+    // The command follows the zero flow. A wall that acts on the command alone leaves a leak or a flow to be named.
+    let adhesion = Hidden::Adhesion(40.0);
+    assert!(row(adhesion, &look(adhesion, 102)));
+}
+
+#[test]
 #[ignore = "a table: nineteen effects, one after another"]
 fn table_of_effects_beside_a_zero_flow_that_moves() {
     let asked = std::env::var("HIDDEN").unwrap_or_default();

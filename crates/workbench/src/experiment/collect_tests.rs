@@ -294,6 +294,9 @@ fn row(id: &str, truth: &[(&str, f64)], seed: u64, r: &Reconciliation) -> bool {
         };
         println!("{:>21} {}: {}{or}", "", e.id, numbers.join(", "));
     }
+    if r.effects.is_empty() {
+        println!("{:>21} {:?}", "", r.places);
+    }
     if let Some(left) = &r.remainder {
         println!("{:>21} left {:.4}: {}", "", left.share, left.how);
     }
