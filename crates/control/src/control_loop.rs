@@ -126,6 +126,11 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.estimator.neutral_um / self.tuning(state).gain
     }
 
+    /// Variance of that, um^2.
+    pub fn neutral_variance_um2(&self, state: &LoopState<L::State>) -> f64 {
+        state.estimator.stated_um2[2] / self.tuning(state).gain.powi(2)
+    }
+
     /// The columns of adaptation after a tick.
     pub(crate) fn record_adaptation(&self, state: &LoopState<L::State>, out: &mut [f32]) {
         if let (Some(adapter), Some(adapt)) = (&self.adapter, &state.adapt) {
@@ -320,12 +325,14 @@ impl<L: ControlLaw> ControlLoop<L> {
 
     /// The PZT is brought to a zero flow that is not the newest estimate: what was learnt since is not believed, and the bead is
     /// expected where it was seen last. Without that it would be expected as far away as the wrong zero flow says, and the command
-    /// would jump when it is seen again. um of PZT.
-    pub fn rest_at(&self, state: &mut LoopState<L::State>, zero_flow_um: f64) {
-        if zero_flow_um.is_finite() {
-            let scaled_um = self.parts.limits.nearest(zero_flow_um) * self.tuning(state).gain;
+    /// would jump when it is seen again. um of PZT, and its variance, um^2.
+    pub fn rest_at(&self, state: &mut LoopState<L::State>, zero_flow_um: f64, variance_um2: f64) {
+        if zero_flow_um.is_finite() && variance_um2 >= 0.0 {
+            let gain = self.tuning(state).gain;
+            let scaled_um = self.parts.limits.nearest(zero_flow_um) * gain;
+            let scaled_um2 = variance_um2 * gain * gain;
             self.estimator_of(state)
-                .rest_at(&mut state.estimator, scaled_um);
+                .rest_at(&mut state.estimator, scaled_um, scaled_um2);
         }
     }
 

@@ -53,10 +53,11 @@ trait AnyLoop: std::fmt::Debug + Send {
     fn start(&mut self, command_um: f64, neutral_um: f64);
     fn step(&mut self, input: &LoopInput) -> LoopOutput;
     fn skip(&mut self);
-    fn rest_at(&mut self, zero_flow_um: f64);
+    fn rest_at(&mut self, zero_flow_um: f64, variance_um2: f64);
     fn estimator(&self) -> &EstimatorState;
     fn previous_command_um(&self) -> f64;
     fn neutral_um(&self) -> f64;
+    fn neutral_variance_um2(&self) -> f64;
     fn adaptation(&self) -> Option<Adaptation>;
     fn record(&self, out: &mut [f32; LAW_COLUMNS]);
 }
@@ -82,8 +83,9 @@ impl<L: ControlLaw> AnyLoop for Running<L> {
         self.control.skip(&mut self.state);
     }
 
-    fn rest_at(&mut self, zero_flow_um: f64) {
-        self.control.rest_at(&mut self.state, zero_flow_um);
+    fn rest_at(&mut self, zero_flow_um: f64, variance_um2: f64) {
+        self.control
+            .rest_at(&mut self.state, zero_flow_um, variance_um2);
     }
 
     fn estimator(&self) -> &EstimatorState {
@@ -96,6 +98,10 @@ impl<L: ControlLaw> AnyLoop for Running<L> {
 
     fn neutral_um(&self) -> f64 {
         self.control.neutral_um(&self.state)
+    }
+
+    fn neutral_variance_um2(&self) -> f64 {
+        self.control.neutral_variance_um2(&self.state)
     }
 
     fn adaptation(&self) -> Option<Adaptation> {
@@ -234,9 +240,14 @@ impl Controller {
         self.running.skip();
     }
 
+    /// Variance of [`Controller::neutral_um`], um^2.
+    pub fn neutral_variance_um2(&self) -> f64 {
+        self.running.neutral_variance_um2()
+    }
+
     /// The PZT is brought to a zero flow that is not the newest estimate, see [`ControlLoop::rest_at`].
-    pub fn rest_at(&mut self, zero_flow_um: f64) {
-        self.running.rest_at(zero_flow_um);
+    pub fn rest_at(&mut self, zero_flow_um: f64, variance_um2: f64) {
+        self.running.rest_at(zero_flow_um, variance_um2);
     }
 
     /// One tick.

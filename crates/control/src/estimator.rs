@@ -19,10 +19,11 @@ mod uncertainty;
 
 use crate::error::BuildError;
 use crate::loop_model::{LoopModel, MODES};
-use covariance::{USUAL_WALK_UM_PER_SQRT_S, advanced, at_rest};
+use covariance::{advanced, at_rest};
 use transition::Transition;
 
 pub use config::EstimatorConfig;
+pub use covariance::ZERO_FLOW_WALK_UM_PER_SQRT_S;
 pub(crate) use config::planned_gap;
 pub use flow_step::flow_step_log_density;
 pub use stuck::StillBead;
@@ -256,7 +257,7 @@ impl Estimator {
         let motion = self.tick.gain * (command - m.n);
         let ts = self.model.sample_time_s;
         let neutral_walk_um2 = self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
-        let usual_um2 = USUAL_WALK_UM_PER_SQRT_S.powi(2) * ts;
+        let usual_um2 = ZERO_FLOW_WALK_UM_PER_SQRT_S.powi(2) * ts;
         state.lag = state.lag.saturating_sub(1);
         if state.stuck {
             state.modes = [0.0; MODES];

@@ -65,7 +65,7 @@ pub use controller::{Controller, ControllerConfig, LoopConfig};
 pub use error::{BuildError, Parameter};
 pub use estimator::{
     Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState, StillBead,
-    flow_step_log_density,
+    ZERO_FLOW_WALK_UM_PER_SQRT_S, flow_step_log_density,
 };
 pub use feedforward::FeedForwardState;
 pub use law::{

@@ -30,6 +30,8 @@ pub enum FaultKind {
     FlowStep,
     /// The PZT moves the bead the wrong way: its sign is flipped about the zero flow.
     GainFlip,
+    /// The PZT stands at the zero flow of the time at which it began: the best that anything can do for a bead that nobody sees.
+    HoldZeroFlow,
     /// The amplifier gives no displacement beyond [`Faults::clip_um`].
     ClipAmplifier,
     /// Random bytes on the line to the board and from it, one burst per millisecond.

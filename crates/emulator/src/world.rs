@@ -57,6 +57,8 @@ pub struct World {
     /// Second bead: distance along the channel from the first, and position across it.
     second_um: Option<(f64, f64)>,
     stuck_um: Option<f64>,
+    /// Zero flow at which the PZT is made to stand, um.
+    stands_um: Option<f64>,
     brownian: Random,
     localisation: Random,
     localisation_um: f64,
@@ -125,6 +127,7 @@ impl World {
             lateral_um: 0.0,
             second_um: None,
             stuck_um: None,
+            stands_um: None,
             brownian: Random::stream(config.seed, 1),
             localisation: Random::stream(config.seed, 2),
             localisation_um,
@@ -256,7 +259,13 @@ impl World {
         self.zero_flow_um = self.zero_flow.advance(dt_s, stepped);
         let partner_um = self.partner.as_mut().map_or(0.0, |p| p.advance(dt_s));
         self.chain.set_beside_um(partner_um - self.zero_flow_um);
-        self.chain.advance(self.reached_um(applied_um), dt_s);
+        self.stands_um = if self.active(FaultKind::HoldZeroFlow) {
+            self.stands_um.or(Some(self.zero_flow_um()))
+        } else {
+            None
+        };
+        let reached_um = (self.stands_um).unwrap_or_else(|| self.reached_um(applied_um));
+        self.chain.advance(reached_um, dt_s);
         if let Some(cell) = &mut self.cell {
             self.offset_um += cell.surplus_um(at_um, self.chain.bead_um() - before_um);
             cell.advance(at_um, dt_s);

@@ -96,6 +96,7 @@ struct State {
     clipped: bool,
     /// Where the flow stands still, for a PZT that has to stop without a bead to tell.
     rest: rest::Rest,
+    newest_zero_flow: rest::ZeroFlow,
     /// That of the freeze in force, um.
     rest_um: f64,
     /// Frames in a row that were the picture before.
@@ -176,6 +177,10 @@ impl<R: ReferenceGenerator> Core<R> {
             timing.camera_delay_ms * 1e-3,
         );
         controller.start(displacement_um, neutral_um);
+        let zero_flow = rest::ZeroFlow {
+            um: neutral_um,
+            variance_um2: controller.neutral_variance_um2(),
+        };
         Ok(Self {
             preview_um: vec![0.0; controller.preview_len()],
             planned_gap: estimator.planned_gap(),
@@ -225,7 +230,8 @@ impl<R: ReferenceGenerator> Core<R> {
                 following,
                 pauses: Default::default(),
                 clipped: false,
-                rest: rest::Rest::new(neutral_um),
+                rest: rest::Rest::new(zero_flow),
+                newest_zero_flow: zero_flow,
                 rest_um: neutral_um,
                 pictures_repeated: 0,
                 parked_at: None,
@@ -459,7 +465,7 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         let output = self.controller.step(&given);
         self.watch_rest(fix, &output, tick.steps);
-        self.state.told_um = output.neutral_um;
+        self.state.told_um = self.state.rest.zero_flow().um;
         let obeyed = in_force.is_none();
         self.watch_following(fix, generated.reference_um, obeyed, &output, tick);
         let nominal = self.timing.camera_delay_ms * 1e-3 / self.sample_s;

@@ -1,8 +1,8 @@
 //! The covariance of position and zero flow, `[p11, p12, p22]`: a tick on, at rest, and after a correction.
 
-/// Walk of the zero flow that the stated uncertainty counts with: 6 nm about its mean within 20 s, sd sqrt(2 / time), as a rig at rest
-/// does. The gains are made for eight times of that, so that they follow a rig that is worse.
-pub(super) const USUAL_WALK_UM_PER_SQRT_S: f64 = 1.9e-3;
+/// Walk of the zero flow that the stated uncertainty counts with, um/sqrt(s): 6 nm about its mean within 20 s, sd sqrt(2 / time), as a rig
+/// at rest does. The gains are made for eight times of that, so that they follow a rig that is worse.
+pub const ZERO_FLOW_WALK_UM_PER_SQRT_S: f64 = 1.9e-3;
 
 /// A covariance one tick later: `gain` is the way for a displacement of 1 um, then the variances of the walks of bead and zero flow.
 pub(super) fn advanced(

@@ -1,6 +1,6 @@
 //! What a wrong gain may cause, how well the present position is known, and a zero flow that is believed instead of the estimate.
 
-use super::covariance::{USUAL_WALK_UM_PER_SQRT_S, advanced};
+use super::covariance::{ZERO_FLOW_WALK_UM_PER_SQRT_S, advanced};
 use super::{Estimator, EstimatorState, HISTORY};
 
 /// Uncertainty of neutral after a bead came free, um: it may have drifted meanwhile, or the verdict may have been
@@ -49,16 +49,17 @@ impl Estimator {
         }
         let (g, ts) = (self.tick.gain, self.model.sample_time_s);
         let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * ts + state.spread_um2;
-        let flow_um2 = USUAL_WALK_UM_PER_SQRT_S.powi(2) * ts;
+        let flow_um2 = ZERO_FLOW_WALK_UM_PER_SQRT_S.powi(2) * ts;
         for _ in 0..back {
             stated_um2 = advanced(stated_um2, g, walk_um2, flow_um2);
         }
         stated_um2[0].max(0.0).sqrt()
     }
 
-    /// Believes this zero flow, and that the PZT has been there since the newest fix.
-    pub(crate) fn rest_at(&self, state: &mut EstimatorState, neutral_um: f64) {
+    /// Believes this zero flow, known with this variance, and that the PZT has been there since the newest fix.
+    pub(crate) fn rest_at(&self, state: &mut EstimatorState, neutral_um: f64, variance_um2: f64) {
         state.neutral_um = neutral_um;
+        state.stated_um2[2] = variance_um2;
         state.history_um = [neutral_um; HISTORY];
         state.modes = Default::default();
         (state.covariance_um2[1], state.stated_um2[1]) = (0.0, 0.0);
@@ -112,7 +113,7 @@ mod tests {
             estimator.push(&mut state, command_um);
             bead_um += gain * dt * (command_um - zero_um)
                 + (2.0 * config.diffusion_um2_per_s * dt).sqrt() * noise(&mut draw);
-            zero_um += USUAL_WALK_UM_PER_SQRT_S * dt.sqrt() * noise(&mut draw);
+            zero_um += ZERO_FLOW_WALK_UM_PER_SQRT_S * dt.sqrt() * noise(&mut draw);
         }
         unreachable!("the last tick returns from {command_um} um")
     }

@@ -224,6 +224,30 @@ fn a_gain_that_is_flipped_and_an_amplifier_that_clips_move_the_bead_otherwise() 
 }
 
 #[test]
+fn a_pzt_that_stands_at_the_zero_flow_lets_no_command_move_the_bead() {
+    let at_um = |held_um: f64, events: Faults| {
+        let config = WorldConfig {
+            faults: Faults {
+                flow_step_um: 0.5,
+                ..events
+            },
+            ..quiet()
+        };
+        let mut world = world(&config);
+        world.advance_to(100 * MS, 20.0);
+        let from_um = world.bead_um();
+        world.advance_to(200 * MS, held_um);
+        world.bead_um() - from_um
+    };
+    let holds = || Faults::default().with(FaultKind::HoldZeroFlow, 0.1, Some(0.1));
+    let steps = |from_s| holds().with(FaultKind::FlowStep, from_s, None);
+    assert_eq!(at_um(23.0, holds()), 0.0);
+    // The flow that has stepped before is stopped, and one that steps later carries the bead.
+    assert!(at_um(23.0, steps(0.1)).abs() < 1e-9);
+    assert!(at_um(23.0, steps(0.15)) < -5.0);
+}
+
+#[test]
 fn a_frozen_picture_is_the_same_to_the_bit_under_new_numbers_while_the_bead_goes_on() {
     let config = WorldConfig {
         drift_um_per_s: 10.0,

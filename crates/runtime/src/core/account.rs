@@ -213,7 +213,7 @@ impl<R: ReferenceGenerator> Core<R> {
         if self.state.life != Life::Safe {
             return Action::Command {
                 command_um: output.command_um,
-                neutral_um: output.neutral_um,
+                neutral_um: self.state.told_um,
             };
         }
         let confirmed = self

@@ -169,7 +169,7 @@ impl<R: ReferenceGenerator> Core<R> {
     }
 
     pub(super) fn freeze(&mut self, reason: FreezeReason, tick: &mut Tick) {
-        let rest_um = self.state.rest.zero_flow_um();
+        let rest_um = self.state.rest.zero_flow().um;
         self.freeze_at(reason, rest_um, tick);
     }
 
@@ -184,7 +184,8 @@ impl<R: ReferenceGenerator> Core<R> {
             let newest_um = self.controller.neutral_um();
             self.state.rest_um = rest_um;
             if BLIND.contains(&reason) && self.state.rest_um != newest_um {
-                self.controller.rest_at(self.state.rest_um);
+                let variance_um2 = self.state.rest.zero_flow().variance_um2;
+                self.controller.rest_at(self.state.rest_um, variance_um2);
             }
         }
         if self.state.frozen.add(reason) {

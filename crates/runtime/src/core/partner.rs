@@ -51,6 +51,7 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         let out = partner.step(&mut state.partner.state, &given);
         state.rest.shift(out.shift_um);
+        state.newest_zero_flow.um += out.shift_um;
         state.rest_um += out.shift_um;
         let status = state.partner.state.status();
         let lost = status == PartnerStatus::Lost;

@@ -2,7 +2,7 @@
 
 use super::Core;
 use super::following::{Instead, Seen};
-use super::rest::Seen as RestSeen;
+use super::rest::{Rest, Seen as RestSeen, ZeroFlow};
 use crate::life::{EventKind, FreezeReason, Life};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
@@ -41,20 +41,27 @@ impl<R: ReferenceGenerator> Core<R> {
         output: &LoopOutput,
         steps: u64,
     ) {
-        self.state.rest.wait(steps);
-        let Some(fix) = fix.filter(|_| self.state.life == Life::Running) else {
-            return;
+        self.state.rest.wait(steps, self.sample_s);
+        let newest = ZeroFlow {
+            um: output.neutral_um,
+            variance_um2: self.controller.neutral_variance_um2(),
         };
-        let walk_um2 = 2.0 * self.diffusion_um2_per_s * self.sample_s;
+        let newest = std::mem::replace(&mut self.state.newest_zero_flow, newest);
+        if self.state.life != Life::Running {
+            self.state.rest = Rest::new(newest);
+            return;
+        }
+        let Some(fix) = fix else { return };
         let model = self.controller.settings().model;
         let gain = self.controller.adaptation().map_or(1.0, |now| now.gain);
         let seen = RestSeen {
             innovation_um: output.innovation_um,
-            variance_um2: walk_um2 + fix.variance_um2.max(0.0),
-            newest_um: [self.state.told_um, output.neutral_um],
+            walk_um2: 2.0 * self.diffusion_um2_per_s * self.sample_s,
+            fix_um2: fix.variance_um2.max(0.0),
+            newest,
             gain: gain * model.fast_gain_per_s() * model.sample_time_s,
         };
-        self.state.rest.step(&seen, output.flags, self.sample_s);
+        self.state.rest.step(&seen, output.flags);
     }
 
     /// A bead that moves against the commands, or follows them up to a level and no further, is frozen at the zero flow of before.
@@ -83,7 +90,7 @@ impl<R: ReferenceGenerator> Core<R> {
             fix: on_time.map(|fix| (fix.position_um, fix.variance_um2)),
             reference_um,
             command_um: output.command_um,
-            zero_flow_um: state.rest.zero_flow_um(),
+            zero_flow_um: state.rest.zero_flow().um,
         });
         let pauses = state.following.pause_um().is_some();
         state.pauses.step(pauses, tick);

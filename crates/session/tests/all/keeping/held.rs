@@ -14,7 +14,7 @@ pub(super) const GAIN_PER_S: f64 = 428.0;
 /// Where the bead rests before a step of the flow, um; it wanders by some nm.
 const ZERO_FLOW_UM: f64 = 20.0;
 /// Start of the first event, and its errors count from there, s.
-const EVENT_S: f64 = 2.6;
+pub(super) const EVENT_S: f64 = 2.6;
 const FROM_NS: i64 = 2_550_000_000;
 
 /// Events around a held bead.
@@ -32,6 +32,11 @@ pub(super) struct Row {
     /// The rig has none of the imperfections of a real one: the limits of the table are those of such a rig.
     pub ideal: bool,
     pub seconds: f64,
+    /// Time without a bead after which the run ends, s.
+    pub lost_s: f64,
+    pub frames: Frames,
+    /// Gain of the rig over that of the model.
+    pub gain: f64,
 }
 
 impl Row {
@@ -46,6 +51,9 @@ impl Row {
             clip_um: 40.0,
             ideal: true,
             seconds: 4.0,
+            lost_s: 1.0,
+            frames: Frames::On,
+            gain: 1.0,
         }
     }
 
@@ -126,7 +134,7 @@ impl Row {
         file.timing.budget_us = 0.5 * period_us;
         file.timing.solver_us = 0.17 * period_us;
         file.timing.coast_ticks = (20e3 / period_us) as u32;
-        file.timing.lost_ticks = (1e6 / period_us) as u32;
+        file.timing.lost_ticks = (self.lost_s * 1e6 / period_us) as u32;
         let world = &mut file.emulator;
         world.seed = seed;
         world.rate_hz = self.rate_hz;
@@ -137,6 +145,9 @@ impl Row {
         world.zero_flow_drift_um_per_s = Some(1e-3);
         world.faults.flow_step_um = self.flow_step_um();
         world.faults.clip_um = self.clip_um;
+        if self.gain != 1.0 {
+            world.model = plant(self.gain);
+        }
         let mut events = self.events.clone();
         if let Some(um) = self.second_um {
             world.faults.second_bead_um = um;
@@ -185,6 +196,17 @@ impl fmt::Display for Row {
             events.join(", ")
         )
     }
+}
+
+/// The file of the plant of Eq. (6) with another gain.
+fn plant(gain: f64) -> String {
+    let path = format!("{}/keeping-{gain}.toml", env!("CARGO_TARGET_TMPDIR"));
+    let num = [0.01872, 379.29528, 32_667.167_52].map(|value| value * gain);
+    let text = format!(
+        "working_point_um = 20.0\n\n[plant]\nnum = {num:?}\nden = [1.0, 76.3, 0.13]\n"
+    );
+    std::fs::write(&path, text).expect("a file");
+    path
 }
 
 #[derive(Default)]
@@ -257,6 +279,12 @@ pub(super) fn hold(row: &Row, seed: u64) -> Held {
     )
 }
 
+/// The ticks of a row, holding at 0 um.
+pub(super) fn ticks(row: &Row, seed: u64) -> Vec<TickRecord> {
+    let reference = ReferenceSpec::Hold { position_um: 0.0 };
+    finish(row, seed, reference).sink.0
+}
+
 /// The ticks of a row whose bead is to follow a script.
 pub(super) fn follow(row: &Row, seed: u64, text: String) -> Vec<TickRecord> {
     let script = ReferenceSpec::Script {
@@ -273,7 +301,7 @@ pub(super) fn follow(row: &Row, seed: u64, text: String) -> Vec<TickRecord> {
 fn finish(row: &Row, seed: u64, reference: ReferenceSpec) -> Finished<Ticks> {
     let options = Options {
         clock: ClockKind::Virtual,
-        frames: Frames::On,
+        frames: row.frames,
         best_effort: true,
     };
     let mut rig = Rig::open(row.file(seed), options).expect("an emulated rig");

@@ -14,6 +14,8 @@ pub(super) struct Steps {
     pub settled_ms: Vec<f64>,
     /// Good fixes that tracker or estimator refused.
     pub refused: usize,
+    /// Furthest true position from the middle of the picture in each step, um.
+    pub furthest_um: Vec<f64>,
 }
 
 fn script(steps: usize) -> String {
@@ -34,9 +36,10 @@ fn script(steps: usize) -> String {
     )
 }
 
-/// So many steps under a law on a rig with the imperfections of a real one.
-pub(super) fn go(law: &'static str, seed: u64, steps: usize) -> Steps {
+/// So many steps under a law on a rig with the imperfections of a real one, whose gain is so many times the model's.
+pub(super) fn go(law: &'static str, seed: u64, steps: usize, gain: f64) -> Steps {
     let row = Row {
+        gain,
         ideal: false,
         seconds: 2.0 + 0.1 * steps as f64 + 0.5,
         ..Row::step(law, 0.0)
@@ -47,6 +50,7 @@ pub(super) fn go(law: &'static str, seed: u64, steps: usize) -> Steps {
 fn judged(ticks: &[TickRecord]) -> Steps {
     let running: Vec<&TickRecord> = ticks.iter().filter(|t| t.is_running()).collect();
     let mut settled_ms = Vec::new();
+    let mut furthest_um = Vec::new();
     // Where each step begins, ns, and how long after it the bead was outside last.
     let mut step: Option<(i64, f64)> = None;
     for pair in running.windows(2) {
@@ -57,10 +61,14 @@ fn judged(ticks: &[TickRecord]) -> Steps {
         if leaves {
             settled_ms.extend(step.map(|(_, ms)| ms));
             step = Some((before.time_ns, 0.0));
+            furthest_um.push(0.0_f64);
         }
         let Some((since_ns, outside_ms)) = &mut step else {
             continue;
         };
+        if let Some(um) = furthest_um.last_mut() {
+            *um = um.max(now.true_um.abs());
+        }
         let since_ms = (now.time_ns - *since_ns) as f64 * 1e-6;
         if since_ms > 95.0 {
             continue;
@@ -82,5 +90,6 @@ fn judged(ticks: &[TickRecord]) -> Steps {
     Steps {
         settled_ms,
         refused,
+        furthest_um,
     }
 }
