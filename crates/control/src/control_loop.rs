@@ -303,8 +303,11 @@ impl<L: ControlLaw> ControlLoop<L> {
             .in_force
             .filter(|stood| stood.displacement_um.is_finite())?;
         let scaled_um = stood.displacement_um * self.tuning(state).gain;
-        let newest = state.estimator.history_um.iter_mut().take(stood.ticks);
-        newest.for_each(|um| *um = scaled_um);
+        let (before_um, before_ticks) = stood.before;
+        let before_um = before_um * self.tuning(state).gain;
+        let mut history = state.estimator.history_um.iter_mut();
+        (history.by_ref().take(stood.ticks)).for_each(|um| *um = scaled_um);
+        history.take(before_ticks).for_each(|um| *um = before_um);
         state.previous_um = stood.displacement_um;
         state.hidden_um = 0.0;
         Some(stood.displacement_um)

@@ -23,8 +23,8 @@ use covariance::{advanced, at_rest};
 use transition::Transition;
 
 pub use config::EstimatorConfig;
-pub use covariance::ZERO_FLOW_WALK_UM_PER_SQRT_S;
 pub(crate) use config::planned_gap;
+pub use covariance::ZERO_FLOW_WALK_UM_PER_SQRT_S;
 pub use flow_step::flow_step_log_density;
 pub use stuck::StillBead;
 pub use transition::PredictedState;

@@ -41,6 +41,8 @@ pub struct InForce {
     pub displacement_um: f64,
     /// Ticks up to the one before this for which it stood.
     pub ticks: usize,
+    /// The displacement before that, um, and its ticks; 0: what was commanded.
+    pub before: (f64, usize),
 }
 
 /// What a tick is given.

@@ -10,12 +10,18 @@ pub struct Learners {
     all: Vec<Option<CycleLearning>>,
     /// The motion of the last tick.
     motion: u16,
+    /// Gain over the model's that the check before the run found, for a law that does not follow the gain.
+    armed_gain: Option<f64>,
 }
 
 impl Learners {
     /// One learner for each motion by its number ([`crate::ReferenceOutput::motion`]).
     pub fn new(all: Vec<Option<CycleLearning>>) -> Self {
-        Self { all, motion: 0 }
+        Self {
+            all,
+            motion: 0,
+            armed_gain: None,
+        }
     }
 
     /// What each of them has learned.
@@ -55,10 +61,14 @@ impl Learners {
 
     /// Gain that the feed-forward is to be divided by in this tick; see [`CycleLearning::feed_forward_gain`].
     pub(crate) fn feed_forward_gain(&self) -> Option<f64> {
-        self.all
-            .get(usize::from(self.motion))?
-            .as_ref()?
-            .feed_forward_gain()
+        let learning = self.all.get(usize::from(self.motion));
+        let learned = learning.and_then(|learning| learning.as_ref()?.feed_forward_gain());
+        learned.or(self.armed_gain)
+    }
+
+    /// The check before the run found this gain over the model's.
+    pub(crate) fn set_armed_gain(&mut self, gain: Option<f64>) {
+        self.armed_gain = gain;
     }
 
     /// After the controller's step: learns from the fix that was used, by what moved the bead.

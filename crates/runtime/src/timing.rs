@@ -53,6 +53,15 @@ impl Timing {
         (self.period_us * 1e3).round() as i64
     }
 
+    /// Silence after which a board is asked to hold zero flow, ms. A command is made for the next two delays: in the first its effect is
+    /// not seen yet, in the second the next ones answer it. A PZT that keeps it for longer drives the bead past its target. Five periods
+    /// at least, so that a few lost commands hold nothing.
+    pub fn board_watchdog_ms(&self) -> u16 {
+        let period_ms = self.period_us * 1e-3;
+        let delay_ms = self.camera_delay_ms + 0.5 * period_ms;
+        (2.0 * delay_ms).max(5.0 * period_ms).ceil().min(1e4) as u16
+    }
+
     /// Budget of a tick, ns.
     pub fn budget_ns(&self) -> i64 {
         (self.budget_us * 1e3).round() as i64

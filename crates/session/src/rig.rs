@@ -163,6 +163,7 @@ impl Rig {
                 neutral_um: self.file.first_neutral_um,
                 reference,
                 timing: self.file.timing,
+                watchdog_ms: self.watchdog_ms(),
                 arming: self.file.arming,
                 learn: None,
                 motions: Vec::new(),
@@ -170,6 +171,12 @@ impl Rig {
             model: prepared.model,
             controller: prepared.controller,
         })
+    }
+
+    /// Silence after which the board is asked to hold, ms.
+    fn watchdog_ms(&self) -> u16 {
+        let [asked, _] = self.file.watchdogs_ms();
+        asked.unwrap_or_else(|| self.file.timing.board_watchdog_ms())
     }
 
     /// The slow partner as the loop knows it, for a PZT with these limits.
@@ -285,7 +292,7 @@ impl Rig {
         } else {
             session_number()
         };
-        let [watchdog_ms, hold_watchdog_ms] = self.file.watchdogs_ms();
+        let [_, hold_watchdog_ms] = self.file.watchdogs_ms();
         let session = ArmRequest {
             session: id,
             park_um: limits.park_um,
@@ -296,7 +303,7 @@ impl Rig {
                 limits.high_um,
                 self.file.limits.slew_um_per_s.min(own.slew_um_per_s),
             ],
-            watchdog_ms,
+            watchdog_ms: Some(setup.config.watchdog_ms),
             hold_watchdog_ms,
         };
         self.fresh = false;

@@ -192,6 +192,9 @@ pub struct SetupConfig {
     pub reference: ReferenceSpec,
     /// Times and counts of the loop.
     pub timing: Timing,
+    /// Silence after which the board is asked to hold zero flow, ms.
+    #[serde(default = "default_watchdog_ms")]
+    pub watchdog_ms: u16,
     /// The check before the loop is closed.
     pub arming: ArmingConfig,
     /// The slow partner of the PZT, if there is one.
@@ -203,6 +206,11 @@ pub struct SetupConfig {
     /// Learning on the periodic motions of a script.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub motions: Vec<MotionSpec>,
+}
+
+/// Of a record without the key: the board's own.
+fn default_watchdog_ms() -> u16 {
+    20
 }
 
 /// The predicted amplitude density of the measured error, one-sided, in two parts whose squares add.
@@ -332,7 +340,8 @@ impl Setup {
             &plant.plant,
             [self.config.displacement_um, self.config.neutral_um],
         )
-        .map_err(Failure::input)?;
+        .map_err(Failure::input)?
+        .with_watchdog_ms(self.config.watchdog_ms);
         Ok(match partner {
             Some(partner) => core.with_partner(partner),
             None => core,

@@ -145,7 +145,7 @@ impl Findings<'_> {
                 (table, "watchdog_ms"),
                 &ms,
                 format!("watchdog_ms = {ms}: less than five periods of {period_ms} ms"),
-                "20 ms lets a stall of the machine pass; the board holds the bead meanwhile",
+                "leave the key out: a run asks for a time that fits its period and delay",
             );
         }
         if let [Some(watchdog), Some(hold)] = board

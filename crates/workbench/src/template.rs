@@ -114,7 +114,6 @@ kind = \"emulated\"        # rendered frames; a real camera: --camera PATH_OF_A_
 kind = \"serial\"
 port = {port:?}
 baud = 3000000           # no effect on USB CDC and pseudo-terminals
-watchdog = \"20ms\"        # silence after which the board holds zero flow
 hold_watchdog = \"2s\"     # holding time after which it parks
 
 [camera]
@@ -194,7 +193,7 @@ mod tests {
             assert_eq!((file.limits.park_um, file.timing.period_us), (20.0, 1000.0));
             assert_eq!(file.is_emulated(), kind == Kind::Emulated);
             if kind != Kind::Emulated {
-                assert_eq!(file.watchdogs_ms(), [Some(20), Some(2000)]);
+                assert_eq!(file.watchdogs_ms(), [None, Some(2000)]);
             }
         }
     }

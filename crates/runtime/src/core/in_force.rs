@@ -4,13 +4,15 @@
 //! last. A loop that went on as if its commands were obeyed would learn a zero flow that is none. What is used here is in the
 //! record of a run (time, whether the board was heard, its state and output), so that a replay sees the same.
 
+use super::Core;
 use cellpos_control::InForce;
 use cellpos_rig::{ActuatorReport, ActuatorState};
 
-/// Silence after which nothing is taken to reach the board, ns. A board answers each command: ten of them, and half of its
-/// watchdog's time.
+/// Silence after which nothing is taken to reach the board, ns: a board answers each command.
 const SILENT_NS: i64 = 10_000_000;
-/// Silence after which a board holds: its watchdog's time, ns.
+/// The longest pause between two reports that counts as usual, ns.
+const LONGEST_PAUSE_NS: i64 = 20_000_000;
+/// Watchdog's time of a board that nobody asked for another, ns.
 const WATCHDOG_NS: i64 = 20_000_000;
 /// What a longest usual pause between reports keeps of itself from report to report: it halves in 700.
 const KEPT: f64 = 0.999;
@@ -26,6 +28,8 @@ pub(super) struct Board {
     /// Longest usual pause between its reports, ns: some lines deliver them in bursts.
     pause_ns: f64,
     silent: bool,
+    /// Silence after which it holds, ns.
+    watchdog_ns: i64,
 }
 
 impl Board {
@@ -37,6 +41,7 @@ impl Board {
             zero_flow_um,
             pause_ns: 0.0,
             silent: false,
+            watchdog_ns: WATCHDOG_NS,
         }
     }
 
@@ -56,40 +61,63 @@ impl Board {
     ) -> Option<InForce> {
         // A loop slower than a board's answers hears one in a tick at best.
         let least_ns = SILENT_NS.max(3 * period_ns);
-        let watchdog_ns = WATCHDOG_NS.max(2 * least_ns);
+        let longest_ns = LONGEST_PAUSE_NS.max(2 * least_ns);
         let since_ns = now_ns - self.heard_ns;
+        let ticks = |ns: i64| usize::try_from(ns / period_ns).unwrap_or(1);
+        // Silent until now, it stood where it was, and held from its watchdog's time on.
+        let held = ticks(since_ns - self.watchdog_ns).max(1);
+        let before = (self.applied_um, ticks(since_ns).saturating_sub(held));
         if let Some(report) = report {
-            let pause_ns = since_ns.min(watchdog_ns) as f64;
+            let pause_ns = since_ns.min(longest_ns) as f64;
             self.pause_ns = (KEPT * self.pause_ns).max(pause_ns);
             self.heard_ns = now_ns;
             self.applied_um = report.applied_um;
+            let held_before = self.holding || self.silent;
             self.holding = report.state == ActuatorState::Holding;
             self.zero_flow_um = told_um;
             self.silent = false;
             return self.holding.then_some(InForce {
                 displacement_um: report.applied_um,
-                ticks: 1,
+                ticks: if held_before { 1 } else { held },
+                before: if held_before { (0.0, 0) } else { before },
             });
         }
-        let allowed_ns = (1.5 * self.pause_ns).clamp(least_ns as f64, watchdog_ns as f64);
+        let allowed_ns = (1.5 * self.pause_ns).clamp(least_ns as f64, longest_ns as f64);
         if since_ns as f64 <= allowed_ns {
             return None;
         }
-        let holds = self.holding || since_ns > watchdog_ns;
-        let ticks = if self.silent {
-            1
-        } else {
-            usize::try_from(since_ns / period_ns).unwrap_or(1)
+        let stands = InForce {
+            displacement_um: self.applied_um,
+            ticks: if self.silent { 1 } else { ticks(since_ns) },
+            before: (0.0, 0),
         };
-        self.silent = true;
-        Some(InForce {
-            displacement_um: if holds {
-                self.zero_flow_um
-            } else {
-                self.applied_um
-            },
-            ticks,
+        let was_silent = std::mem::replace(&mut self.silent, true);
+        if self.holding || since_ns <= self.watchdog_ns {
+            return Some(stands);
+        }
+        let holds = InForce {
+            displacement_um: self.zero_flow_um,
+            ticks: 1,
+            ..stands
+        };
+        Some(if was_silent {
+            holds
+        } else {
+            InForce {
+                ticks: held,
+                before,
+                ..holds
+            }
         })
+    }
+}
+
+impl<R> Core<R> {
+    /// The same loop with a board that holds zero flow after a silence of this time, ms.
+    #[must_use]
+    pub fn with_watchdog_ms(mut self, watchdog_ms: u16) -> Self {
+        self.state.in_force.watchdog_ns = i64::from(watchdog_ms) * 1_000_000;
+        self
     }
 }
 

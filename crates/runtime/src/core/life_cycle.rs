@@ -100,6 +100,9 @@ impl<R: ReferenceGenerator> Core<R> {
                         self.latch(SafeReason::ArmingRefused, tick);
                     }
                     None => {
+                        if self.controller.adaptation().is_none() {
+                            self.learners.set_armed_gain(verdict.nearest_gain());
+                        }
                         if verdict.gain_ratio.is_finite() {
                             tick.event(EventKind::ArmingPassed {
                                 gain_ratio: verdict.gain_ratio,

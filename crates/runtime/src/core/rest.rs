@@ -129,7 +129,10 @@ mod tests {
         let mut rest = Rest::new(known(20.0, 2e-3));
         for (newest_um, innovation_um) in fixes {
             rest.wait(1, 1e-3);
-            rest.step(&fix(known(newest_um, 4e-3), innovation_um), LoopFlags::default());
+            rest.step(
+                &fix(known(newest_um, 4e-3), innovation_um),
+                LoopFlags::default(),
+            );
         }
         rest.zero_flow().um
     }

@@ -397,7 +397,8 @@ impl RigFile {
         }
     }
 
-    /// Command watchdog and hold watchdog requested from the board, ms; `None` leaves the board's own.
+    /// Command watchdog and hold watchdog requested from the board by the file, ms. Without the first, a run requests
+    /// [`Timing::board_watchdog_ms`]; without the second, the board's own is left.
     pub fn watchdogs_ms(&self) -> [Option<u16>; 2] {
         match self.actuator {
             ActuatorConfig::Serial {
@@ -410,7 +411,11 @@ impl RigFile {
                 hold_watchdog_ms,
                 ..
             } => [watchdog_ms, hold_watchdog_ms],
-            ActuatorConfig::Emulated {} => [None, None],
+            ActuatorConfig::Emulated {} => {
+                let own_ms = self.board.watchdog_ms;
+                let asked = own_ms != BoardConfig::default().watchdog_ms;
+                [asked.then_some(own_ms), None]
+            }
             // Five periods, as for a program: the board's own 20 ms would expire between two commands.
             ActuatorConfig::EmulatedPressure { period_ms, .. } => {
                 [Some((5.0 * period_ms).round() as u16), None]

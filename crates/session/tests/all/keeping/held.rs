@@ -202,9 +202,8 @@ impl fmt::Display for Row {
 fn plant(gain: f64) -> String {
     let path = format!("{}/keeping-{gain}.toml", env!("CARGO_TARGET_TMPDIR"));
     let num = [0.01872, 379.29528, 32_667.167_52].map(|value| value * gain);
-    let text = format!(
-        "working_point_um = 20.0\n\n[plant]\nnum = {num:?}\nden = [1.0, 76.3, 0.13]\n"
-    );
+    let text =
+        format!("working_point_um = 20.0\n\n[plant]\nnum = {num:?}\nden = [1.0, 76.3, 0.13]\n");
     std::fs::write(&path, text).expect("a file");
     path
 }

@@ -124,6 +124,34 @@ fn the_uncertainty_of_a_bead_that_is_not_seen_is_its_error_however_long_it_takes
 }
 
 #[test]
+fn a_silent_line_takes_the_bead_hardly_further_than_a_pzt_that_stands_still() {
+    let seeds = number("KEEPING_SEEDS").unwrap_or(3);
+    let mut broken = Vec::new();
+    for (law, for_s) in [
+        ("lqg", 0.005),
+        ("lqg", 0.02),
+        ("mpc", 0.05),
+        ("own", 0.1),
+        ("lqg", 0.19),
+        ("pi", 0.19),
+    ] {
+        let mut worst = 0.0_f64;
+        for seed in 1..=seeds {
+            let [silent_um, stands_um] = silence::silent_um(law, seed, for_s);
+            let more_um = silent_um - stands_um;
+            worst = worst.max(more_um);
+            if more_um > 0.3 {
+                broken.push(format!(
+                    "{law}, {for_s} s, seed {seed}: {silent_um} um, {stands_um} um"
+                ));
+            }
+        }
+        println!("{law}, silent for {for_s} s: at most {worst:.2} um more");
+    }
+    assert!(broken.is_empty(), "{broken:#?}");
+}
+
+#[test]
 fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sight() {
     for (seed, law) in LAWS.into_iter().enumerate() {
         for clip_um in [19.9, 19.98] {
@@ -160,6 +188,20 @@ fn steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms_under_every_law() {
         assert_eq!(steps.settled_ms.len(), count, "{law}");
         assert_eq!(steps.refused, 0, "{law}");
         assert!(worst_ms <= most_ms, "{law}: {worst_ms} ms");
+    }
+}
+
+#[test]
+fn steps_of_10_um_on_a_rig_of_another_gain_overshoot_by_a_tenth_at_most() {
+    for (law, gain) in [("pi", 0.5), ("pi", 2.0), ("lqg", 2.0), ("own", 0.5)] {
+        let steps = steps::go(law, 1, 6, gain);
+        let furthest_um = steps.furthest_um.iter().copied().fold(0.0, f64::max);
+        println!(
+            "{law}, gain {gain}: {:.0?} ms, {furthest_um:.1} um",
+            steps.settled_ms
+        );
+        assert_eq!(steps.refused, 0, "{law}, gain {gain}");
+        assert!(furthest_um < 6.0, "{law}, gain {gain}: {furthest_um} um");
     }
 }
 
