@@ -126,9 +126,9 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.estimator.neutral_um / self.tuning(state).gain
     }
 
-    /// Variance of that, um^2.
+    /// Variance of that if the zero flow walks as fast as the estimator is made for, um^2.
     pub fn neutral_variance_um2(&self, state: &LoopState<L::State>) -> f64 {
-        state.estimator.stated_um2[2] / self.tuning(state).gain.powi(2)
+        state.estimator.covariance_um2[2] / self.tuning(state).gain.powi(2)
     }
 
     /// The columns of adaptation after a tick.

@@ -240,7 +240,7 @@ impl Controller {
         self.running.skip();
     }
 
-    /// Variance of [`Controller::neutral_um`], um^2.
+    /// Variance of [`Controller::neutral_um`], um^2, see [`ControlLoop::neutral_variance_um2`].
     pub fn neutral_variance_um2(&self) -> f64 {
         self.running.neutral_variance_um2()
     }

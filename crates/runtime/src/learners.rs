@@ -61,9 +61,11 @@ impl Learners {
 
     /// Gain that the feed-forward is to be divided by in this tick; see [`CycleLearning::feed_forward_gain`].
     pub(crate) fn feed_forward_gain(&self) -> Option<f64> {
-        let learning = self.all.get(usize::from(self.motion));
-        let learned = learning.and_then(|learning| learning.as_ref()?.feed_forward_gain());
-        learned.or(self.armed_gain)
+        // What is learned is right beside the gain that it began with.
+        match self.all.get(usize::from(self.motion)) {
+            Some(Some(learning)) => learning.feed_forward_gain(),
+            _ => self.armed_gain,
+        }
     }
 
     /// The check before the run found this gain over the model's.

@@ -127,6 +127,8 @@ fn the_uncertainty_of_a_bead_that_is_not_seen_is_its_error_however_long_it_takes
 fn a_silent_line_takes_the_bead_hardly_further_than_a_pzt_that_stands_still() {
     let seeds = number("KEEPING_SEEDS").unwrap_or(3);
     let mut broken = Vec::new();
+    // The other PZT stands at the true zero flow. The walk of a bead leaves 2 nm of it unknown, and the flow for 1 um is 428 um/s.
+    let unknown_um = |for_s: f64| 3.0 * 428.0 * 2e-3 * for_s;
     for (law, for_s) in [
         ("lqg", 0.005),
         ("lqg", 0.02),
@@ -140,7 +142,7 @@ fn a_silent_line_takes_the_bead_hardly_further_than_a_pzt_that_stands_still() {
             let [silent_um, stands_um] = silence::silent_um(law, seed, for_s);
             let more_um = silent_um - stands_um;
             worst = worst.max(more_um);
-            if more_um > 0.3 {
+            if more_um > 0.3 + unknown_um(for_s) {
                 broken.push(format!(
                     "{law}, {for_s} s, seed {seed}: {silent_um} um, {stands_um} um"
                 ));
