@@ -291,6 +291,7 @@ impl Adapter {
 
     /// A tick that never came: the command was held.
     pub(crate) fn skip(&self, state: &mut AdaptState, command_um: f64) {
+        state.news = None;
         self.learn(state, None);
         // The command that cancels the lines should have changed; the difference moves the bead.
         let rest_um = command_um - state.cancel_um;

@@ -282,6 +282,19 @@ fn a_strong_line_and_stalls_from_the_start_on_are_no_change_of_the_gain() {
     assert_eq!(judge(&row, 60, 4), None);
 }
 
+/// The tick that reports the change is the last one before a stall.
+#[test]
+fn a_change_before_a_stall_is_reported_once() {
+    let row = Row {
+        gain: [1.0, 0.5],
+        stalls: 1.0,
+        ..plain(2)
+    };
+    let mut kept = Kept::default();
+    stay(&row, 99_752, 80, &mut kept);
+    assert_eq!(kept.events, 1);
+}
+
 #[test]
 fn a_channel_that_clogs_in_a_quarter_of_an_hour_is_within_the_interval() {
     let clogs = Row {
