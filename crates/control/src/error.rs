@@ -42,7 +42,10 @@ pub enum BuildError {
         longest_ms: f64,
     },
     /// The plant has more modes than the estimator holds.
-    #[error("the model has {given} modes besides its integrator: the estimator holds {most}")]
+    #[error(
+        "the model has {given} modes besides its integrator: the estimator holds {most}. Measure one on this rig that begins without \
+         them, with `[plant] num = [428.0], den = [1.0, 0.0]` (`cellpos identify --model`), or leave the shortest lag out"
+    )]
     TooManyModes {
         /// Modes of the model.
         given: usize,
