@@ -333,7 +333,7 @@ impl WorldConfig {
             cell.rest_um,
             0.1,
             room_um,
-            "less than the frame's height: height_px * pixel_um, less lateral_um and a pixel on either side",
+            "less than the frame's height less lateral_um and a pixel on either side: enlarge [emulator] height_px",
         )?;
         let most_um = cell.rest_um * cell.stretch_first.max(cell.stretch_last);
         within(
@@ -341,7 +341,7 @@ impl WorldConfig {
             most_um,
             0.1,
             along_um,
-            "less than the frame's width: width_px * pixel_um",
+            "less than the frame's width: enlarge [emulator] width_px",
         )?;
         Ok(())
     }

@@ -341,7 +341,7 @@ impl Arming {
             return verdict;
         }
         let Some(verdict) = self.fitted(&state.all) else {
-            return GainCheck::unmeasured(Some(Refusal::NoBead));
+            return GainCheck::unmeasured(Some(Refusal::LostInPulse));
         };
         // A path that is always late delays the answer and leaves its size; one that is late now and then may do anything to it.
         let always = state.disturbances + self.settling_ticks >= tick;

@@ -151,9 +151,9 @@ fn without_a_steady_bead_the_pzt_never_moves() {
 }
 
 #[test]
-fn a_bead_lost_during_the_pulse_is_no_bead() {
+fn a_bead_lost_during_the_pulse_is_told_as_that() {
     let (verdict, _) = run(ArmingConfig::default(), 1.0, |tick| tick > 22);
-    assert_eq!(verdict.refusal, Some(Refusal::NoBead));
+    assert_eq!(verdict.refusal, Some(Refusal::LostInPulse));
 }
 
 #[test]

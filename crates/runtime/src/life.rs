@@ -147,6 +147,8 @@ pub enum FreezeReason {
 pub enum Refusal {
     /// No steady bead was seen in the time given.
     NoBead,
+    /// The bead was seen in too little of the pulse.
+    LostInPulse,
     /// The bead did not move with the PZT beyond its own noise.
     NoResponse,
     /// The bead moved the other way.
@@ -155,6 +157,13 @@ pub enum Refusal {
     WrongGain,
     /// Time went so unevenly in every pulse that nothing can be told from the answers.
     Disturbed,
+}
+
+impl Refusal {
+    /// Whether there was no bead, or no longer: with another one in view arming may succeed.
+    pub fn lacks_a_bead(self) -> bool {
+        matches!(self, Self::NoBead | Self::LostInPulse)
+    }
 }
 
 /// What happened. Times in milliseconds, positions in micrometres.

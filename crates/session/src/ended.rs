@@ -125,8 +125,6 @@ pub(crate) struct Clues {
     arming: Option<(Refusal, f64, f64)>,
     /// Gain over the model's, and half its 95 % interval, from an accepted pulse.
     passed: Option<(f64, f64)>,
-    /// Tick of the refusal.
-    refused_at: u64,
     board: Option<(State, Fault)>,
     late_us: Option<f64>,
     stale_ms: Option<f64>,
@@ -144,7 +142,6 @@ impl Clues {
                 ci95,
             } => {
                 self.arming = Some((refusal, gain_ratio, ci95));
-                self.refused_at = event.seq;
             }
             EventKind::ArmingPassed { gain_ratio, ci95 } => self.passed = Some((gain_ratio, ci95)),
             EventKind::ActuatorClipped { level_um } => self.clipped_um = Some(level_um),
@@ -255,7 +252,7 @@ impl Clues {
         let gain = format!("{ratio:+.2} of the model's gain (95 %: +-{ci95:.2})");
         let range = format!("{} to {}", arming.lowest_ratio, arming.highest_ratio);
         match refusal {
-            Refusal::NoBead if self.refused_at < u64::from(arming.patience_ticks) => sentences(
+            Refusal::LostInPulse => sentences(
                 "the bead was in view, and was lost while the arming pulse moved it",
                 format!(
                     "positions in half of the {} ticks of the pulse at least",

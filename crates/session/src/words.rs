@@ -90,6 +90,7 @@ fn freeze_reason(reason: FreezeReason) -> &'static str {
 fn refusal(reason: Refusal) -> &'static str {
     match reason {
         Refusal::NoBead => "no steady bead was seen",
+        Refusal::LostInPulse => "the bead was lost while the arming pulse moved it",
         Refusal::NoResponse => "the bead did not move with the PZT beyond its own noise",
         Refusal::WrongSign => "the bead moved the wrong way: is the sign in [calibration] right?",
         Refusal::WrongGain => "with this gain the controller may be unstable",

@@ -25,7 +25,7 @@ pub enum DesignWarning {
     },
     /// The loop delay was given and differs from what the model contains.
     #[error(
-        "all figures are for the loop delay of {used_ms:.3} ms that was asked for; the model's own effects make it {model_ms:.3} ms"
+        "all figures are for the loop delay of {used_ms:.3} ms of the rig file or of --delay; the model's own effects make it {model_ms:.3} ms"
     )]
     DelayDiffers {
         /// Delay designed for, ms.

@@ -210,10 +210,7 @@ fn next(result: &Result<Reconciliation, ReconcileError>) -> Option<(Experiment, 
             Some((experiment, why))
         }),
         Ok(_) => None,
-        Err(ReconcileError::NoRecords) => Some((
-            Experiment::Survey,
-            "there is no record yet, and a survey comes first".to_owned(),
-        )),
+        Err(ReconcileError::NoRecords) => Some((Experiment::Survey, "no record yet".to_owned())),
         Err(error @ (ReconcileError::ConstantInput | ReconcileError::TooShort { .. })) => {
             Some((Experiment::Survey, error.to_string()))
         }

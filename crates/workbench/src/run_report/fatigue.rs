@@ -193,7 +193,7 @@ fn panel(
         ArmKind::Cyclic => (Axis::linear("cycle", ""), "over the cycles", 0),
         ArmKind::Static => (
             Axis::linear("time under static load", "s"),
-            "at rest under static load",
+            "held under static load",
             1,
         ),
     };

@@ -143,7 +143,7 @@ fn cycles_of(rows: &[CycleRow], what: &str) -> String {
             }
             _ => "; a static arm: the ",
         };
-        text.push_str(&format!("{then}{what} at rest under load for {fixed:.0} s"));
+        text.push_str(&format!("{then}{what} held under load for {fixed:.0} s"));
     }
     text
 }

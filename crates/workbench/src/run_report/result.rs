@@ -73,7 +73,7 @@ pub(super) fn section(
 /// What the lowest possible error is, and that it is calculated.
 fn of_bound(bound: &Bound) -> String {
     format!(
-        " The lowest possible is calculated: what Brownian motion ({} um2/s) does within the delay of the loop.",
+        " The lowest possible is calculated: what Brownian motion ({:.2} um2/s) does within the delay of the loop.",
         bound.diffusion_um2_per_s
     )
 }
@@ -158,7 +158,7 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
     text.push('.');
     if let Some(fixed) = trend(under_load(rows).map(|row| (row.cycle, rest.stretch(row)))) {
         text.push_str(&format!(
-            " At rest under a static load: stretch {}.",
+            " Held under a static load: stretch {}.",
             change(&fixed)
         ));
     }

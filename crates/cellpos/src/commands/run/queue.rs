@@ -112,7 +112,7 @@ impl Queue {
                 return Ok(Some(format!("stopped by {signal}")));
             }
             let over = self.one(args, number, tries)?;
-            let missing = over.ended.refusal == Some(Refusal::NoBead);
+            let missing = over.ended.refusal.is_some_and(Refusal::lacks_a_bead);
             if missing && live && asked.elapsed().as_secs_f64() < args.queue.patience.value() {
                 // The folder of a search that found nothing holds nothing that anyone asked for.
                 let _ = std::fs::remove_dir_all(&over.folder);

@@ -319,7 +319,8 @@ fn on_rig(
 
 /// Whether another run may succeed without a person's action: a stall may be over, and after a lost bead another may come.
 fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
-    let lost = ended.refusal == Some(Refusal::NoBead) || ended.reason == Some(SafeReason::BeadLost);
+    let lost = ended.refusal.is_some_and(Refusal::lacks_a_bead)
+        || ended.reason == Some(SafeReason::BeadLost);
     ended.may_pass() || had_bead && lost
 }
 

@@ -34,7 +34,7 @@ fn panel(compared: &[Compared], arm: ArmKind, quantity: &Quantity) -> Option<Pan
     const SPREAD: f64 = 0.6;
     let title = match arm {
         ArmKind::Cyclic => "over the cycles",
-        ArmKind::Static => "at rest under static load (in cycles' time)",
+        ArmKind::Static => "held under static load (in cycles' time)",
     };
     let mut panel = Panel::new(
         Axis::linear("cycle", ""),
