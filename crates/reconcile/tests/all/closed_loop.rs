@@ -176,15 +176,21 @@ fn lagged(state: &mut f64, u: f64, share: f64) -> f64 {
 }
 
 /// Mean over a step of an oscillator's position, and its acceleration over `w^2` at the step's start; `state` (position and speed) goes on
-/// to the end of the step, by the midpoint rule.
-fn swung(state: &mut [f64], u: f64, w: f64, damping: f64, h: f64) -> (f64, f64) {
-    let (x, v) = (state[0], state[1]);
+/// to the end of the step, by the midpoint rule in quarters: in one piece it swings 0.13 % too fast at 280 Hz.
+fn swung(state: &mut [f64], u: f64, w: f64, damping: f64, step_s: f64) -> (f64, f64) {
+    const PIECES: usize = 4;
+    let h = step_s / PIECES as f64;
     let bends = |x: f64, v: f64| w * w * (u - x) - 2.0 * damping * w * v;
-    let starts = bends(x, v) / (w * w);
-    let (x_half, v_half) = (x + 0.5 * h * v, v + 0.5 * h * bends(x, v));
-    state[0] = x + h * v_half;
-    state[1] = v + h * bends(x_half, v_half);
-    (x_half, starts)
+    let starts = bends(state[0], state[1]) / (w * w);
+    let mut mean = 0.0;
+    for _ in 0..PIECES {
+        let (x, v) = (state[0], state[1]);
+        let (x_half, v_half) = (x + 0.5 * h * v, v + 0.5 * h * bends(x, v));
+        state[0] = x + h * v_half;
+        state[1] = v + h * bends(x_half, v_half);
+        mean += x_half / PIECES as f64;
+    }
+    (mean, starts)
 }
 
 #[test]

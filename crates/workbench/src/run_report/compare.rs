@@ -213,18 +213,29 @@ fn of_holds(compared: &[Compared]) -> Option<String> {
     let held = || compared.iter().filter_map(|run| Some((run, run.rms_nm?)));
     let least = held().min_by(|a, b| a.1.total_cmp(&b.1))?;
     let most = held().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let ci95_nm = |run: &Compared| run.rms_ci95_nm.unwrap_or(f64::NAN);
     let said = |(run, nm): (&Compared, f64)| {
-        let error = with_interval(nm, run.rms_ci95_nm.unwrap_or(f64::NAN));
+        let error = with_interval(nm, ci95_nm(run));
         let possible = run
             .bound_rms_nm
-            .map(|nm| format!(" where {nm:.0} are possible"));
+            .map(|nm| format!(" (lowest possible {nm:.0})"));
         format!(
-            "{error} nm RMS in {}{}",
+            "in {}, {error} nm RMS{}",
             run.name,
             possible.unwrap_or_default()
         )
     };
-    Some(format!("Error from {} to {}.", said(least), said(most)))
+    let chance_nm = ci95_nm(least.0).hypot(ci95_nm(most.0));
+    let difference = match most.1 - least.1 > chance_nm {
+        true => "a difference beyond chance",
+        false if chance_nm.is_nan() => "what of it is chance is not known",
+        false => "no difference beyond chance",
+    };
+    Some(format!(
+        "The error was smallest {} and largest {}: {difference}.",
+        said(least),
+        said(most)
+    ))
 }
 
 #[cfg(test)]
@@ -319,7 +330,7 @@ mod tests {
         let text = of_holds(&study).unwrap();
         assert_eq!(
             text,
-            "Error from 50.0\u{a0}±\u{a0}1.0 nm RMS in a where 44 are possible to 80.0\u{a0}±\u{a0}1.0 nm RMS in b."
+            "The error was smallest in a, 50.0\u{a0}±\u{a0}1.0 nm RMS (lowest possible 44) and largest in b, 80.0\u{a0}±\u{a0}1.0 nm RMS: a difference beyond chance."
         );
     }
 }
