@@ -121,6 +121,15 @@ impl<L: ControlLaw> ControlLoop<L> {
         Some(adapter.adaptation(state.adapt.as_ref()?))
     }
 
+    /// The gain over the model's was measured before the loop is closed, with this standard deviation: the estimate of the plant begins
+    /// there. A loop that does not adapt does without.
+    pub fn start_estimate(&self, state: &mut LoopState<L::State>, gain: f64, sd: f64) {
+        let measured = gain.is_finite() && sd.is_finite() && sd > 0.0;
+        if let (Some(adapter), Some(adapt), true) = (&self.adapter, &mut state.adapt, measured) {
+            adapter.tell(adapt, gain, sd);
+        }
+    }
+
     /// Displacement at which the bead rests, um of PZT.
     pub fn neutral_um(&self, state: &LoopState<L::State>) -> f64 {
         state.estimator.neutral_um / self.tuning(state).gain

@@ -91,19 +91,14 @@ impl Ended {
                 )
             )
     }
-}
 
-impl Ended {
     /// The failure of a command that needed another end; `help` says how to continue.
     pub fn failure(&self, help: &str) -> Failure {
         let advice = [self.to_do.as_str(), help];
         let advice = advice.iter().filter(|part| !part.is_empty());
         let help = advice.copied().collect::<Vec<_>>().join("; ");
-        let expected = match self.expected.is_empty() {
-            true => String::new(),
-            false => format!("; expected {}", self.expected),
-        };
-        Failure::Failed(miette::miette!(help = help, "{}{expected}", self.seen))
+        let (seen, to_do) = (self.clone(), String::new());
+        Failure::Failed(miette::miette!(help = help, "{}", Self { to_do, ..seen }))
     }
 }
 
@@ -198,7 +193,6 @@ impl Clues {
         let by_operator = summary.end == End::Operator
             || summary.safe_reason == Some(SafeReason::Operator)
             || trouble.is_none() && summary.state != EndState::Safe && summary.end == End::Safe;
-        let kept = &summary.kept;
         let kind = match (trouble, summary.state) {
             (Some(_), _) => EndKind::Failed,
             _ if recorder.is_some() => EndKind::Unrecorded,
@@ -213,8 +207,7 @@ impl Clues {
         let (seen, wanted, to_do) = match kind {
             EndKind::Done => sentences("the time of the run was over", "", ""),
             EndKind::ReferenceOver => sentences("the reference came to its end", "", ""),
-            EndKind::NotKept => not_kept(kept, self.clipped_um),
-            EndKind::Operator | EndKind::Stopped => sentences("the operator ended the run", "", ""),
+            EndKind::NotKept => not_kept(&summary.kept, self.clipped_um),
             EndKind::Unrecorded => sentences(
                 recorder.map_or("the run was not recorded", RecorderFault::sentence),
                 "a disk that takes the record",
@@ -228,6 +221,7 @@ impl Clues {
                 "bring a bead into view, or run longer",
             ),
             EndKind::Safe => self.safe(summary.safe_reason, expected),
+            EndKind::Operator | EndKind::Stopped => sentences("the operator ended the run", "", ""),
         };
         let said = |sentence: String| of_what_is_followed(&sentence, expected.cell);
         Ended {

@@ -215,6 +215,16 @@ impl Belief {
         self.finding()
     }
 
+    /// Takes a gain that was measured otherwise, with its standard deviation, whatever the delay is.
+    pub(super) fn tell(&mut self, gain: f64, sd: f64) {
+        let information = 1.0 / (sd * sd);
+        let measured = Likelihood {
+            score: information * gain,
+            information,
+        };
+        self.observe(&[measured; DELAYS], 0.0);
+    }
+
     fn finding(&self) -> Finding {
         let at: [Part; DELAYS] = std::array::from_fn(|d| self.delay(d));
         let of_gain = Part::sum(at.iter().copied());

@@ -119,6 +119,11 @@ impl Evidence {
         }
     }
 
+    /// Takes a gain that was measured otherwise, with its standard deviation. Nothing is stated before a block of fixes.
+    pub(super) fn tell(&mut self, gain: f64, sd: f64) {
+        self.belief.tell(gain, sd);
+    }
+
     /// A fix. Whether a block is complete, so that [`Evidence::conclude`] has something to say.
     pub(super) fn add(&mut self, fix: &Products) -> bool {
         for i in 0..MEMBERS {

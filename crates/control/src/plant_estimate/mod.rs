@@ -182,6 +182,11 @@ impl Adapter {
         }
     }
 
+    /// A gain over the model's that was measured otherwise, with its standard deviation.
+    pub(crate) fn tell(&self, state: &mut AdaptState, gain: f64, sd: f64) {
+        state.evidence.tell(gain, sd);
+    }
+
     fn usable(&self) -> [bool; TUNINGS] {
         self.estimators.map(|one| one.is_some())
     }

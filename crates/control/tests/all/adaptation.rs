@@ -339,3 +339,35 @@ fn a_tuning_that_moves_makes_no_bump() {
         );
     }
 }
+
+/// The arming pulse measures the gain to some 3 %: a loop that is told of it does not start with the doubt of one that knows nothing.
+#[test]
+fn the_estimate_begins_with_the_gain_that_arming_measured() {
+    let farthest = |seed: u64, told: bool| {
+        let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
+        let mut controller = Controller::new(adapting(lqg())).unwrap();
+        controller.start(20.0, 20.0);
+        if told {
+            controller.start_estimate(1.0, 0.03);
+        }
+        (0..1000)
+            .map(|_| {
+                tick(&mut controller, &mut rig);
+                controller.adaptation().unwrap().gain.ln().abs()
+            })
+            .fold(0.0, f64::max)
+    };
+    let worst = |told: bool| (0..20).map(|seed| farthest(seed, told)).fold(0.0, f64::max);
+    let (told, untold) = (worst(true), worst(false));
+    assert!(told < 0.1 && untold > 2.0 * told, "{told}, {untold}");
+    // What was measured wrongly is forgotten where the fixes say otherwise.
+    let mut rig = SimulatedRig::new(RigConfig::eq6(3)).unwrap();
+    let mut controller = Controller::new(adapting(lqg())).unwrap();
+    controller.start(20.0, 20.0);
+    controller.start_estimate(0.5, 0.02);
+    (0..20_000).for_each(|_| {
+        tick(&mut controller, &mut rig);
+    });
+    let now = controller.adaptation().unwrap();
+    assert!((now.gain - 1.0).abs() < 0.2, "{now:?}");
+}

@@ -1,8 +1,15 @@
 //! Bead and camera blocks: what acts on the motion, and how the frames sample it.
 
-use super::Frames;
 use super::modal::Trace;
 use cellpos_plant::effects::{Block, Piece};
+
+/// What the frames are like.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Frames {
+    pub(super) skew: f64,
+    pub(super) delay_s: f64,
+    pub(super) exposure_s: f64,
+}
 
 /// When the frames of a record were exposed, beyond what effects say.
 #[derive(Debug, Clone, Default)]

@@ -9,6 +9,7 @@ mod camera;
 mod input;
 mod modal;
 
+use camera::Frames;
 pub(crate) use camera::{Sampling, near_whole};
 use cellpos_plant::TiedPlant;
 use cellpos_plant::effects::{Action, Around, Block, Piece, Shown};
@@ -101,14 +102,6 @@ enum Stage {
 
 /// Most steps of a plant with something tied to it between two rows.
 const MOST_STEPS: f64 = 20.0;
-
-/// What the frames are like.
-#[derive(Debug, Clone, Copy, Default)]
-struct Frames {
-    skew: f64,
-    delay_s: f64,
-    exposure_s: f64,
-}
 
 struct Chain<'a> {
     base: &'a Base,
