@@ -125,8 +125,8 @@ impl<L: ControlLaw> ControlLoop<L> {
     /// there. A loop that does not adapt does without.
     pub fn start_estimate(&self, state: &mut LoopState<L::State>, gain: f64, sd: f64) {
         let measured = gain.is_finite() && sd.is_finite() && sd > 0.0;
-        if let (Some(adapter), Some(adapt), true) = (&self.adapter, &mut state.adapt, measured) {
-            adapter.tell(adapt, gain, sd);
+        if let Some(adapt) = state.adapt.as_mut().filter(|_| measured) {
+            adapt.tell(gain, sd);
         }
     }
 

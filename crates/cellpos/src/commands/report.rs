@@ -39,7 +39,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     }
 }
 
-/// Where the page is, or what it says.
+/// Prints the path of the page, or its figures as JSON.
 fn say<T: Serialize>(
     written: &Written<T>,
     as_json: bool,

@@ -68,8 +68,8 @@ fn rig(plant: &DesignPlant) -> Result<SimulatedRig, PlantError> {
 pub(crate) struct NoiseFree {
     /// True position at each tick, um.
     pub(crate) position_um: Vec<f64>,
-    /// The same half a tick before, um: a command that is held moves the bead between ticks as it likes.
-    half_before_um: Vec<f64>,
+    /// Command from each tick on, um.
+    command_um: Vec<f64>,
     /// Largest command change per tick, um.
     largest_move_um: f64,
 }
@@ -84,15 +84,12 @@ pub(crate) fn noise_free(
 ) -> Result<NoiseFree, SetUpError> {
     let mut controller = Controller::new(*config)?;
     let mut rig = rig(plant)?;
-    let ts = plant.sample_time_s;
-    let between = DiscretePlant::new(&plant.plant, Seconds(ts), Seconds(0.5 * ts))?;
-    let mut between_state = between.state(0.0);
     controller.start(plant.neutral_um, plant.neutral_um);
     let mut preview = vec![0.0; controller.preview_len()];
     let mut last = controller.previous_command_um();
     let mut run = NoiseFree {
         position_um: Vec::with_capacity(ticks),
-        half_before_um: Vec::with_capacity(ticks),
+        command_um: Vec::with_capacity(ticks),
         largest_move_um: 0.0,
     };
     for k in 0..SETTLE_TICKS + ticks {
@@ -107,9 +104,6 @@ pub(crate) fn noise_free(
         }
         if active {
             run.position_um.push(rig.true_um());
-            let drifted_um = drift_um_per_s * ts * (tick as f64 - 0.5).max(0.0);
-            run.half_before_um
-                .push(between.output_um(&between_state) + drifted_um);
         }
         let input = LoopInput {
             measurement: Some(rig.measure()),
@@ -119,11 +113,11 @@ pub(crate) fn noise_free(
         };
         let out = controller.step(&input);
         if active {
+            run.command_um.push(out.command_um);
             run.largest_move_um = run.largest_move_um.max((out.command_um - last).abs());
         }
         last = out.command_um;
         rig.advance(out.command_um);
-        between.step(&mut between_state, out.command_um - plant.neutral_um);
     }
     Ok(run)
 }
@@ -206,12 +200,20 @@ pub fn cycle_figures(
     let wish_um = |k: f64| reference.at_um(k * ts);
     let all = ticks(from_s + 2.0 * span_s);
     let run = noise_free(plant, config, all, 0.0, |k| wish_um(k as f64))?;
+    // A command that is held moves the bead between ticks as it likes: positions half a tick before each.
+    let between = DiscretePlant::new(&plant.plant, Seconds(ts), Seconds(0.5 * ts))?;
+    let mut state = between.state(0.0);
+    let half_before = run.command_um.iter().map(|um| {
+        let before_um = between.output_um(&state);
+        between.step(&mut state, um - plant.neutral_um);
+        before_um
+    });
     let from = ticks(from_s + span_s).max(1);
     let (mut low_um, mut high_um, mut squares) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
-    for k in from..all {
+    for (k, half_before_um) in half_before.enumerate().skip(from) {
         let off_um = |tick: usize| run.position_um[tick] - wish_um(tick as f64);
         let (begin, end) = (off_um(k - 1), off_um(k));
-        let middle = run.half_before_um[k] - wish_um(k as f64 - 0.5);
+        let middle = half_before_um - wish_um(k as f64 - 0.5);
         // Mean square of the parabola through the three.
         squares += (4.0 * (begin * begin + end * end + 4.0 * middle * middle)
             + 4.0 * middle * (begin + end)

@@ -117,6 +117,13 @@ pub struct AdaptState {
     news: Option<AdaptNews>,
 }
 
+impl AdaptState {
+    /// A gain over the model's that was measured otherwise, with its standard deviation.
+    pub(crate) fn tell(&mut self, gain: f64, sd: f64) {
+        self.evidence.tell(gain, sd);
+    }
+}
+
 /// A tick as the estimate sees it.
 pub(crate) struct TickOutcome {
     /// The fix that came, whether or not it was used.
@@ -180,11 +187,6 @@ impl Adapter {
             force: Retuning::default(),
             news: None,
         }
-    }
-
-    /// A gain over the model's that was measured otherwise, with its standard deviation.
-    pub(crate) fn tell(&self, state: &mut AdaptState, gain: f64, sd: f64) {
-        state.evidence.tell(gain, sd);
     }
 
     fn usable(&self) -> [bool; TUNINGS] {
