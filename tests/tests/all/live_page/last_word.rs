@@ -1,14 +1,12 @@
 //! The last word of a run on the page: it is true, and it stays; a line that is lost without one is another picture.
 
-use super::watched::{RUNNING, Watched, pictures};
+use super::watched::{PATIENT, RUNNING, Watched, pictures};
 use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
 use std::process::Command;
 use std::time::Duration;
 
-/// A machine that is busy with a browser may be late for long.
-const PATIENT: &str = "first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 100000\n";
-/// As above, and the bead is gone after six seconds.
+/// Added to a rig file: the bead is gone after six seconds.
 const LOSES: &str = "[[emulator.faults.event]]\nkind = \"lose-bead\"\nat_s = 6.0\n";
 
 /// The page when its program is gone for a while: state, banner, reason, what to do, where the PZT is.
@@ -35,7 +33,7 @@ fn start(rig: &str, more: &str) -> (tempfile::TempDir, Browser, Watched) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
     let page = Browser::start(1400, 1000);
-    let line = format!("track --target 0um --rig rig.toml --view --name word {more}");
+    let line = format!("track --target 0um --view --name word {more}");
     let run = Watched::start(folder.path(), &line);
     page.open(&run.operator);
     page.wait_for(RUNNING, programs::PATIENCE);

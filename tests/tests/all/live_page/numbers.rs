@@ -7,9 +7,6 @@ use serde_json::Value;
 use std::path::Path;
 use std::time::Duration;
 
-/// A machine that is busy with a browser may be late for long.
-const PATIENT: &str = "first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 100000\n";
-
 /// What the page shows in one moment; the traces are read at a cursor.
 const LOOK: &str = "const text = id => document.getElementById(id).textContent, gauge = document.getElementById('gauge-text');
     const box = document.getElementById('traces').getBoundingClientRect(), numbers = text => (text.match(/-?[0-9]+(\\.[0-9]+)?/g) ?? []).map(Number);
@@ -92,9 +89,8 @@ fn rms_nm(rows: &[Row], ticks: u64) -> f64 {
 #[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
 fn every_number_on_the_page_is_the_records_at_the_same_tick() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("rig.toml"), PATIENT).unwrap();
     let page = Browser::start(1400, 1500);
-    let line = "track --target 0um --rig rig.toml --view --name numbers --duration 600s";
+    let line = "track --target 0um --view --name numbers --duration 600s";
     let run = Watched::start(folder.path(), line);
     page.open(&run.operator);
     page.wait_for(RUNNING, programs::PATIENCE);

@@ -5,19 +5,15 @@ use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
 use std::time::Duration;
 
-/// Tables that a rig file leaves out are emulated. A machine that is busy with a browser may be late for long.
-const EMULATED: &str = "first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 1000\n";
-
 #[test]
 #[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
 fn an_identification_is_seen_freezes_and_parks_and_keeps_what_is_finished() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("rig.toml"), EMULATED).unwrap();
     // The browser is there when the run begins.
     let page = Browser::start(1400, 1500);
     let run = Watched::start(
         folder.path(),
-        "identify --rig rig.toml --clock real --frequency 10Hz,20Hz,30Hz,50Hz,70Hz,110Hz,130Hz,150Hz,170Hz,190Hz --led-edges 0 --bootstrap 0 \
+        "identify --clock real --frequency 10Hz,20Hz,30Hz,50Hz,70Hz,110Hz,130Hz,150Hz,170Hz,190Hz --led-edges 0 --bootstrap 0 \
          --out model.toml --report identify.html --view",
     );
     page.open(&run.operator);
@@ -39,9 +35,8 @@ fn an_identification_is_seen_freezes_and_parks_and_keeps_what_is_finished() {
 #[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
 fn a_pzt_moved_by_hand_is_seen_goes_where_the_page_says_freezes_and_parks() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("rig.toml"), EMULATED).unwrap();
     let page = Browser::start(1400, 1500);
-    let mut run = Watched::open(folder.path(), "jog --rig rig.toml --view --speed 5um/s");
+    let mut run = Watched::open(folder.path(), "jog --view --speed 5um/s");
     page.open(&run.operator);
     page.wait_for(RUNNING, programs::PATIENCE);
     page.wait_for(

@@ -2,13 +2,18 @@
 
 use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 /// The page says that the loop is closed, or that the PZT is moved.
 pub(super) const RUNNING: &str = "return document.body.dataset.state === 'running'";
+
+/// A rig file for what is shown in a browser. The browser shares the machine with the loop, which may be late for long; the tables that
+/// are left out are emulated.
+pub(super) const PATIENT: &str = "first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 100000\n";
 
 /// A command with a live page.
 pub(super) struct Watched {
@@ -17,12 +22,14 @@ pub(super) struct Watched {
     pub operator: String,
     /// The link to look.
     pub viewer: String,
+    /// What the command has printed so far: why it ended, where a test waits in vain for its page.
+    printed: Arc<Mutex<String>>,
 }
 
 impl Watched {
-    /// A command that prints both links.
+    /// A command that prints both links, on the folder's `rig.toml`, or on a patient one where there is none.
     pub(super) fn start(folder: &Path, line: &str) -> Self {
-        let mut command = programs::cellpos(folder, line);
+        let mut command = on_a_rig(folder, line);
         command.stdin(Stdio::null());
         Self::printing(command, &["to act:", "to look:"])
     }
@@ -34,9 +41,9 @@ impl Watched {
         Self::printing(command, &["to look:"])
     }
 
-    /// A command that prints both links and reads standard input, which stays open.
+    /// As [`Watched::start`]; the command reads standard input, which stays open.
     pub(super) fn open(folder: &Path, line: &str) -> Self {
-        let mut command = programs::cellpos(folder, line);
+        let mut command = on_a_rig(folder, line);
         command.stdin(Stdio::piped());
         Self::printing(command, &["to act:", "to look:"])
     }
@@ -45,23 +52,28 @@ impl Watched {
     pub(super) fn printing(mut command: Command, links: &[&str]) -> Self {
         let mut child = command
             .stderr(Stdio::piped())
-            .stdout(Stdio::null())
+            .stdout(Stdio::piped())
             .spawn()
             .expect("cellpos starts");
-        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
+        let printed = Arc::new(Mutex::new(String::new()));
+        keep(child.stdout.take().expect("piped"), &printed, |_| ());
+        let (lines, said) = mpsc::channel();
+        keep(child.stderr.take().expect("piped"), &printed, move |line| {
+            // Nobody listens once the links are known.
+            let _ = lines.send(line.to_owned());
+        });
         let mut found: Vec<String> = (links.iter())
             .map(|what| {
-                lines
-                    .find_map(|line| Some(line.ok()?.split_once(what)?.1.trim().to_string()))
-                    .expect("cellpos prints its links")
+                said.iter()
+                    .find_map(|line| Some(line.split_once(what)?.1.trim().to_string()))
+                    .unwrap_or_else(|| panic!("no link: {}", printed.lock().expect("a text")))
             })
             .collect();
-        // What it prints further must not fill the pipe.
-        std::thread::spawn(move || lines.for_each(drop));
         Self {
             child,
             viewer: found.pop().expect("a link to look"),
             operator: found.pop().unwrap_or_default(),
+            printed,
         }
     }
 
@@ -79,9 +91,38 @@ impl Watched {
 
 impl Drop for Watched {
     fn drop(&mut self) {
+        if std::thread::panicking() {
+            let printed = self.printed.lock().expect("a text");
+            println!("the command printed:\n{printed}");
+        }
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// Reads all that a program prints, so that it never waits for a full pipe.
+fn keep(
+    from: impl Read + Send + 'static,
+    printed: &Arc<Mutex<String>>,
+    also: impl Fn(&str) + Send + 'static,
+) {
+    let printed = Arc::clone(printed);
+    std::thread::spawn(move || {
+        for line in BufReader::new(from).lines().map_while(Result::ok) {
+            also(&line);
+            let mut printed = printed.lock().expect("a text");
+            printed.push_str(&line);
+            printed.push('\n');
+        }
+    });
+}
+
+fn on_a_rig(folder: &Path, line: &str) -> Command {
+    let rig = folder.join("rig.toml");
+    if !rig.exists() {
+        std::fs::write(rig, PATIENT).expect("a rig file");
+    }
+    programs::cellpos(folder, &format!("{line} --rig rig.toml"))
 }
 
 /// Waits until something on the page says so.
