@@ -182,25 +182,26 @@ fn a_viewer_looks_on_and_a_page_from_elsewhere_gets_nothing() {
 fn a_script_and_its_folder_show_the_same_run() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("script.toml"), SCRIPT).unwrap();
+    // The browsers are there when the run begins.
+    let [page, other] = [0, 1].map(|_| Browser::start(1400, 1500));
     let run = Watched::start(folder.path(), "run script.toml --ideal --view --name shown");
-    let page = Browser::start(1400, 1500);
     page.open(&run.operator);
     // First what leaves the list of events when the machine is late often.
     shows(&page, "events", "Mark: <b>waves<.b>");
     shows(&page, "script-text", "Cycle [0-9]+ of 80[.]");
     shows(&page, "cycles-text", "[0-9]+ cycles done");
+    // The run waits while the second page comes.
+    page.click_until("pause", &["paused"]);
+    page.screenshot(&pictures().join("script.png"));
     // The same run, from its folder, in another program.
     let watch = Watched::looking(folder.path(), "watch latest-shown --for 300s");
-    let other = Browser::start(1400, 1500);
     other.open(&watch.viewer);
-    other.wait_for(RUNNING, programs::PATIENCE);
-    page.click_until("pause", &["paused"]);
     other.wait_for(
         "return ['frozen', 'disconnected'].includes(document.body.dataset.state)",
-        Duration::from_secs(20),
+        programs::PATIENCE,
     );
-    page.screenshot(&pictures().join("script.png"));
     page.click_until("resume", &["running"]);
+    other.wait_for(RUNNING, programs::PATIENCE);
     let status = run.ended();
     assert!(status.success(), "{status}");
     other.wait_for(
