@@ -1,12 +1,11 @@
 //! The check before the loop is closed: is the plant there, with the sign and roughly the gain of the model?
 //!
-//! The PZT makes a small doublet (up, down, back) about the displacement at which it stood; the bead's frame-to-frame
-//! increments are fitted with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion
-//! makes positions a random walk; a doublet, because it leaves the bead where it was. Of a bead that is
-//! farther from position 0 than the doublet moves it, the first half goes towards 0, so that one at the border of the view stays
-//! in it. Increments near a skipped tick or a late frame are the answer to another pulse and are left
-//! out as long as enough are left; where they refuse the plant, or cannot tell, the pulse is made again and fitted together
-//! with the ones before.
+//! The PZT makes a small doublet (up, down, back) about the displacement at which it stood; the bead's frame-to-frame increments are fitted
+//! with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion makes positions a random walk; a doublet,
+//! because it leaves the bead where it was. If the bead is farther from position 0 than the doublet moves it, the first half goes towards
+//! 0. A bead at the border of the view stays in it. Increments near a skipped tick or a late frame answer another pulse: they are left out
+//! as long as enough remain. If the fit refuses the plant, or cannot decide, the pulse is made again and fitted together with the earlier
+//! ones.
 
 use crate::life::Refusal;
 use cellpos_numeric::units::Seconds;
@@ -21,7 +20,7 @@ pub struct ArmingConfig {
     pub check: bool,
     /// Good positions in a row before the pulse.
     pub steady_ticks: u32,
-    /// Ticks after which arming is given up when the bead is not steadily seen.
+    /// Ticks after which arming ends without a result, because the bead was not steadily seen.
     pub patience_ticks: u32,
     /// Height of the doublet, um of PZT.
     pub pulse_um: f64,
@@ -80,7 +79,7 @@ impl GainCheck {
     }
 }
 
-/// The doublet and what the model says of it; everything is computed before the run.
+/// The doublet and its response according to the model, both computed before the run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arming {
     config: ArmingConfig,
@@ -122,7 +121,7 @@ pub struct ArmingState {
     repeated: u32,
 }
 
-/// What a straight line is fitted from.
+/// Sums for the fit of a straight line.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Sums {
     n: f64,
@@ -160,7 +159,7 @@ const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
 const SEARCH_UM: f64 = 0.1;
 
-/// What a tick of arming is given.
+/// Input of one tick of arming.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmingInput {
     /// The position, um, if there is a good one.
@@ -189,8 +188,8 @@ pub enum Step {
 }
 
 impl Arming {
-    /// Prepares the pulse for a plant seen through a camera path of `camera_delay` and a sample time, with a fix in so many ticks:
-    /// patience and pulse are so much longer.
+    /// Prepares the pulse for a plant seen through a camera path of `camera_delay`, with one fix in `ticks_per_fix` ticks. Patience and
+    /// pulse are longer by that factor.
     ///
     /// # Errors
     /// The plant cannot be discretised.
@@ -351,7 +350,7 @@ impl Arming {
         }
     }
 
-    /// Straight-line fit of increments; none where they are too few.
+    /// Straight-line fit of increments; `None` if there are too few.
     fn fitted(&self, s: &Sums) -> Option<GainCheck> {
         let sxx = s.xx - s.x * s.x / s.n.max(1.0);
         let sxy = s.xy - s.x * s.y / s.n.max(1.0);

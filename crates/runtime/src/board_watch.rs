@@ -1,9 +1,8 @@
-//! Whether the board does what it is told: judged from its reports, beside the loop.
+//! Whether the board obeys its commands, judged from its reports.
 //!
-//! Three things go wrong without a word from the board: another host has armed it, it takes commands and obeys none, or
-//! its output is not where the commands were. A report names the command that it was made under, by the host's time of it;
-//! its output is compared with that command and those shortly before it, however late the report comes. Each trouble must
-//! last.
+//! The board reports none of three troubles: another host has armed it, it takes commands and obeys none, or its output is not where the
+//! commands were. A report names the newest command by its host time. The output is compared with that command and with those shortly
+//! before it, however late the report comes. A trouble counts when it lasts.
 
 use cellpos_rig::{ActuatorReport, ActuatorState};
 
@@ -20,8 +19,8 @@ pub enum BoardTrouble {
 
 /// Commands that are remembered: a second at 1 kHz. A report under an older one says nothing.
 const REMEMBERED: usize = 1024;
-/// How long before the command that a report names others may explain where the output stands, us: a board that
-/// interpolates, or whose slew is less than the loop's, is still on its way from them.
+/// Older commands may explain an output for this long, us. A board that interpolates, or whose slew is less than the loop's, is still on
+/// its way from them.
 const EXPLAINS_US: u64 = 30_000;
 /// An output that is off must be so for this long, ns.
 const LASTS_NS: i64 = 100_000_000;
@@ -39,7 +38,7 @@ pub(crate) struct BoardWatch {
     moved_ns: i64,
     commands: u32,
     off_since_ns: Option<i64>,
-    /// When, by the host's time that goes with the command (us), and where to.
+    /// Host time of each command, us, and its displacement, um.
     given: Box<[(u64, f64); REMEMBERED]>,
     next: usize,
     /// Commands that reach nobody are the line's silence in one direction: as long is waited as for the other, ns.
@@ -61,7 +60,7 @@ impl BoardWatch {
         }
     }
 
-    /// A command was handed over, with the time that goes with it, us.
+    /// A command was handed over, with its host time, us.
     pub(crate) fn commanded(&mut self, time_us: u64, command_um: f64) {
         self.commands = self.commands.saturating_add(1);
         if let Some(slot) = self.given.get_mut(self.next) {
@@ -106,8 +105,8 @@ impl BoardWatch {
         (now_ns - since_ns > LASTS_NS).then_some(BoardTrouble::NotFollowing)
     }
 
-    /// Whether the output that a report tells lies among the command that it names, those shortly before it and the one
-    /// before those. What cannot be compared is explained: no command obeyed, or one that is no longer remembered.
+    /// Whether the output that a report tells lies among the command that it names, those shortly before it and the one before those. An
+    /// output counts as explained if there is no command to compare it with: none was obeyed, or it is no longer remembered.
     fn explains(&self, report: &ActuatorReport) -> bool {
         if report.last_seq.is_none() {
             return true;

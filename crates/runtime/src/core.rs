@@ -1,19 +1,18 @@
 //! One tick of the loop as a pure function of what came in: life cycle, freshness, arming, control, limits, account.
 //!
 //! # The loop contract
-//! 0. Time is the clock's: each tick has its number on a [`Grid`] of the period, and advances plan, controller, estimator
-//!    and learner by the steps that have passed since the tick before: one, or more where ticks were skipped, never none.
-//! 1. A tick starts on the arrival of a new frame; a timer stands in when frames stop. A frame that is not new starts none.
+//! 0. Time is the clock's: each tick has its number on a [`Grid`] of the period. It advances plan, controller, estimator and learner by the
+//!    steps since the tick before: one, or more if ticks were skipped.
+//! 1. A tick starts on the arrival of a new frame; a timer replaces frames that stop. A frame that is not new starts none.
 //! 2. The measurement ring is drained: the newest is kept, the rest counted.
 //! 3. The newest is checked by frame id AND mid-exposure time stamp, see [`cellpos_rig::freshness`].
 //! 4. Estimate. 5. Controller. 6. Finite, range, slew.
 //! 7. The command goes into the actuator ring.
 //! 8. The tick's record goes into the recorder ring (full: dropped, counted, the sequence number runs on).
 //!
-//! Steps 4 to 6 are [`Core::step`]; the drivers ([`crate::live`], [`crate::virtual_run`]) do the rest around it. The
-//! core knows no clock and no device: its input is [`TickInput`], so that the same code runs in real time, on a
-//! virtual clock, and in a replay of a recorded run, to the bit. A step allocates nothing, takes no lock, makes no
-//! system call, formats nothing and logs nothing.
+//! Steps 4 to 6 are [`Core::step`]; the drivers ([`crate::live`], [`crate::virtual_run`]) do the rest around it. The core knows no clock
+//! and no device: its input is [`TickInput`]. The same code runs in real time, on a virtual clock, and in a replay of a recorded run, to
+//! the bit. A step allocates nothing, takes no lock, makes no system call, formats nothing and logs nothing.
 //!
 //! Late means that a command was handed over later than the tick's start plus its budget; the driver finds out and
 //! tells the core with the next tick. Late ticks are counted, never made up for. N late or stale ticks in a row latch
@@ -65,7 +64,7 @@ struct State {
     stale_in_a_row: u32,
     late_in_a_row: u32,
     refused_in_a_row: u32,
-    /// Steps of the grid in a row without a position that was used, and those of them that are a loss.
+    /// Steps of the grid in a row without a position that was used, and the steps among these that count as a loss.
     blind: u32,
     missing: u32,
     /// Ticks in a row without a frame.
@@ -85,9 +84,9 @@ struct State {
     board_heard_ns: i64,
     /// Ticks in a row without a report of the board.
     unheard: u32,
-    /// Ticks in a row in which a command was lost, or the board held the zero flow by itself.
+    /// Ticks in a row in which a command was lost, or the board's watchdog held the zero flow.
     unled: u32,
-    /// What stands at the PZT, and the zero flow that went with the last command, um.
+    /// Displacement at the PZT, and the zero flow in the last command, um.
     in_force: in_force::Board,
     told_um: f64,
     following: following::Following,
@@ -326,7 +325,7 @@ impl<R: ReferenceGenerator> Core<R> {
         self.state.grid.map(|grid| grid.opens_ns(next))
     }
 
-    /// The same loop as after so many ticks.
+    /// The same loop after this number of ticks.
     #[cfg(test)]
     pub(crate) fn counted_from(mut self, seq: u64) -> Self {
         self.state.seq = seq;

@@ -21,19 +21,19 @@ pub struct FrameTally {
     pub backlog: u32,
     /// Frames stamped with a time that has not come.
     pub future: u32,
-    /// Times that the camera began to count anew.
+    /// How often the camera restarted its count.
     pub restarts: u32,
     /// Age of the oldest stale frame, ns.
     pub oldest_ns: i64,
-    /// By how much the worst stamp lies in the future, ns.
+    /// By how much the worst stamp is in the future, ns.
     pub ahead_ns: i64,
     /// Id of the newest frame that came twice or too late.
     pub repeated_id: u64,
 }
 
 impl FrameTally {
-    /// Frames that show a camera, or what stands behind it, to give old pictures for new ones: repeated, stale, from the
-    /// future. Frames that only overtook each other do not.
+    /// Frames that show that the camera, or its driver, hands over old pictures as new ones: repeated, stale, from the future. Frames that
+    /// only overtook each other do not.
     pub fn refused(&self) -> u32 {
         self.doubled
             .saturating_add(self.stale)
@@ -146,7 +146,7 @@ impl FrameWatch {
         self.old_ns = Some(exposed_ns);
     }
 
-    /// Hands over what has come, and begins anew.
+    /// Returns the counts so far and starts again from zero.
     pub(crate) fn take(&mut self, now_ns: i64) -> (Option<Measurement>, FrameTally) {
         let newest = self.newest(now_ns).copied();
         self.newest = None;

@@ -1,10 +1,9 @@
 //! The loop's grid of time: what makes a tick's number that of the clock.
 //!
-//! Tick `k` stands at `origin + k period` and may be made up to [`REACH`] of a period before or after it. The windows of
-//! two ticks overlap, so a frame that drifts through the grid never waits for a window to open: at the end of one it
-//! stands in the middle part of the next. Whatever starts a tick (a frame that is early, late or doubled, a timer), it
-//! advances the loop by the steps of this grid that have passed, so that plan, controller, estimator, learner and cycle
-//! table keep the time of the clock.
+//! Tick `k` is at `origin + k period` and may be made up to [`REACH`] of a period before or after it. The windows of two ticks overlap, so
+//! a frame that drifts through the grid never waits for a window to open. At the end of one window it is in the middle part of the next. A
+//! frame that is early, late or doubled, or a timer, may start a tick. The tick advances the loop by the steps of this grid that have
+//! passed. So plan, controller, estimator, learner and cycle table keep the time of the clock.
 
 /// A tick may be made so far from its place, in parts of a period. Above a half, so that windows overlap: a phase that
 /// leaves one window has `2 REACH - 1` of a period to the nearest edge of the other one, which is what jitter has to

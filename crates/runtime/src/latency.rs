@@ -5,7 +5,7 @@ use serde::Serialize;
 
 /// A histogram of durations in nanoseconds, 3 significant digits, 1 ns to 10 s; longer ones count as 10 s.
 ///
-/// Recording allocates nothing. The maximum is kept exactly and beside the histogram.
+/// Recording allocates nothing. The exact maximum is kept next to the histogram.
 #[derive(Debug, Clone)]
 pub struct Latency {
     histogram: Histogram<u64>,

@@ -1,4 +1,4 @@
-//! Learning over cycles beside a loop: one learner for each periodic motion of its reference generator.
+//! Learning over cycles, next to a loop: one learner for each periodic motion of its reference generator.
 //!
 //! Not here: how is learned, see [`cellpos_control::learning`].
 
@@ -24,7 +24,7 @@ impl Learners {
         }
     }
 
-    /// What each of them has learned.
+    /// The addition that each learner has learned.
     pub fn tables(&self) -> Vec<Option<LearnedTable>> {
         let table = |one: &Option<CycleLearning>| one.as_ref().map(CycleLearning::table);
         self.all.iter().map(table).collect()
@@ -61,7 +61,7 @@ impl Learners {
 
     /// Gain that the feed-forward is to be divided by in this tick; see [`CycleLearning::feed_forward_gain`].
     pub(crate) fn feed_forward_gain(&self) -> Option<f64> {
-        // What is learned is right beside the gain that it began with.
+        // An addition is right together with the gain at which it was learned.
         match self.all.get(usize::from(self.motion)) {
             Some(Some(learning)) => learning.feed_forward_gain(),
             _ => self.armed_gain,
@@ -100,7 +100,7 @@ mod tests {
         CycleLearning::new(learner, state)
     }
 
-    /// A second of a motion whose bead answers the addition by itself: error = sin + addition.
+    /// A second of a motion whose bead answers the addition at once: error = sin + addition.
     fn follow(learners: &mut Learners, motion: u16, frequency_hz: f64) -> f64 {
         let mut last = 0.0;
         for k in 0..1000 {

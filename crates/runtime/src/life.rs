@@ -50,20 +50,20 @@ pub enum Request {
     /// Nothing: go on.
     #[default]
     None = 0,
-    /// Stop the bead where it is.
+    /// Stop the bead at its place.
     Freeze = 1,
     /// Ramp to park.
     Park = 2,
     /// Go on with the script's next step; holds for one tick.
     Skip = 3,
-    /// Stop the bead where it is until something else is asked for; does not end the run.
+    /// Stop the bead at its place until the next request; does not end the run.
     Pause = 4,
-    /// The run is no longer being recorded: stop the bead where it is, then ramp to park.
+    /// The run is no longer being recorded: stop the bead at its place, then ramp to park.
     Unrecorded = 5,
 }
 
 impl Request {
-    /// Whether the bead is to be stopped where it is.
+    /// Whether the bead is to stop at its place.
     pub(crate) fn stops(self) -> bool {
         matches!(self, Self::Freeze | Self::Pause)
     }
@@ -113,7 +113,7 @@ pub enum SafeReason {
     BoardNotObeying,
     /// The board's output did not stand where the commands were.
     BoardNotFollowing,
-    /// The loop stood still for so long that where the bead is cannot be told from what was commanded.
+    /// The loop stood still for so long that the commands no longer say where the bead is.
     Stalled,
     /// The plant did not answer the arming pulse as the model says.
     ArmingRefused,
@@ -155,7 +155,7 @@ pub enum Refusal {
     WrongSign,
     /// The gain is outside the range that the controller is safe for.
     WrongGain,
-    /// Time went so unevenly in every pulse that nothing can be told from the answers.
+    /// Ticks or frames were so irregular in every pulse that the answers say nothing.
     Disturbed,
 }
 
@@ -185,7 +185,7 @@ pub enum EventKind {
     },
     /// A refusal is in doubt (skipped ticks, late frames, a wide interval): the pulse is made again and fitted together with this one.
     ArmingRepeated {
-        /// What the answer would have meant.
+        /// What a regular answer would have meant.
         refusal: Refusal,
         /// Measured gain over the model's; NaN when none was measured.
         gain_ratio: f64,
@@ -215,7 +215,7 @@ pub enum EventKind {
         /// Why.
         reason: FreezeReason,
     },
-    /// Control goes on.
+    /// Control continues.
     FreezeEnded {
         /// How long it lasted.
         lasted_ms: f64,
@@ -225,7 +225,7 @@ pub enum EventKind {
         /// Why.
         reason: SafeReason,
     },
-    /// Frames are missing; one that comes late after all is taken off the count again.
+    /// Frames are missing; a frame that comes late after all leaves the count again.
     FramesDropped {
         /// How many.
         count: u64,
@@ -242,7 +242,7 @@ pub enum EventKind {
     },
     /// Frames are stamped with a time that has not come.
     FrameFromFuture {
-        /// By how much the worst of them.
+        /// By how much the worst frame.
         ahead_ms: f64,
     },
     /// Frames come earlier than expected by more than half a tick: the camera path is shorter than `camera_delay_ms` says.
@@ -269,7 +269,7 @@ pub enum EventKind {
         /// How long it did not.
         lasted_ms: f64,
     },
-    /// The camera began to count its frames anew: it was restarted. Frames lost meanwhile are not known by number.
+    /// The camera restarted its count of frames. Frames lost meanwhile are not known by number.
     CameraRestarted,
     /// Noise, focus or blur come near the end of the range that the settings of vision hold for.
     NearLimit,
@@ -340,7 +340,7 @@ pub enum EventKind {
         /// Times since the last such event.
         count: u16,
     },
-    /// The slow partner is silent, parked or does not obey: the run goes on within the PZT's stroke.
+    /// The slow partner is silent, parked or does not obey: the run continues within the PZT's stroke.
     PartnerLost,
     /// It takes commands again.
     PartnerBack {
@@ -427,7 +427,7 @@ impl Events {
         }
     }
 
-    /// All of them, in order.
+    /// All reasons, in order.
     pub fn iter(&self) -> impl Iterator<Item = &Event> {
         self.events.iter().flatten()
     }

@@ -7,9 +7,8 @@
 //! | actuator | order ring -> board, board -> report ring | control |
 //! | recorder | record and event rings -> sink | 5 ms |
 //!
-//! Nothing in a tick waits for any of the others: a ring that is full refuses, and the refusal is counted. When the
-//! control thread dies its end of the order ring dies with it, and the actuator thread parks the PZT at once; when
-//! the process dies the board's watchdog does.
+//! Nothing in a tick waits for any of the others: a ring that is full refuses, and the refusal is counted. If the control thread dies, its
+//! end of the order ring closes and the actuator thread parks the PZT at once. If the process dies, the board's watchdog parks it.
 
 use crate::core::Core;
 use crate::life::{Life, Request};
@@ -59,7 +58,7 @@ impl Threads {
     }
 }
 
-/// How long the recorder is waited for after the end of a run without a sign of it.
+/// After the end of a run: how long the program waits for a recorder that shows no progress.
 const LAST_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Runs until `end` says so or the operator asks for it.
@@ -133,7 +132,7 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
         let camera = match camera {
             Ok(camera) => camera,
             Err(error) => {
-                // The measurement ring is gone: control freezes and parks by itself; park now, all the same.
+                // The measurement ring is gone: control freezes and parks; park now all the same.
                 operator.ask(Request::Park);
                 let _ = control.join();
                 let _ = serving.join();
@@ -204,7 +203,7 @@ fn finished<S>(
     }
 }
 
-/// The recorder's thread. It owns what it writes to, so that it can be left behind when a write never comes back.
+/// The recorder's thread. It owns its files, so that the program can leave it behind if a write never returns.
 struct Recording<S> {
     thread: JoinHandle<Recorded<S>>,
     pulse: Arc<Pulse>,

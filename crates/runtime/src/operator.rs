@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 pub struct Operator {
     asked: AtomicU8,
     recorder: AtomicU8,
-    /// Complement of the bits of the target, um: 0, the complement of a number that is none, while nothing was said.
+    /// Complement of the bits of the target, um: 0, the complement of no finite number, while nothing was requested.
     target: AtomicU64,
 }
 

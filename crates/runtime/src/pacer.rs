@@ -1,15 +1,14 @@
 //! When a tick starts: on a new frame, or on the timer where none comes; never twice in a step of the clock's grid.
 //!
-//! Camera and loop need not agree in rate or phase. The windows of the steps overlap ([`REACH`]), so a frame that comes
-//! while the next step's window is open starts its tick at once. One that comes before that is not used, and the frame
-//! after it is waited for: it finds the window open. So a camera that drifts through the grid costs one tick without a
-//! frame, or one frame that is not used, each time that it is a whole period off. A frame waits only where its tick would
-//! be closer than [`APART`] to the one before it. Where the camera is slower, ticks in which none of its frames is to come are
-//! made when they are due, without waiting for one. Knows no clock and no thread: it is told the time.
+//! Camera and loop need not agree in rate or phase. The windows of the steps overlap ([`REACH`]), so a frame that comes while the next
+//! step's window is open starts its tick at once. One that comes before that is not used, and the frame after it is waited for: it finds
+//! the window open. A camera that drifts through the grid costs one tick without a frame, or one unused frame, per whole period of drift. A
+//! frame waits only where its tick would be closer than [`APART`] to the one before it. Where the camera is slower, ticks in which none of
+//! its frames is to come are made when they are due, without waiting for one. Knows no clock and no thread: its caller gives it the time.
 
 use crate::grid::REACH;
 
-/// A frame may come this late, in parts of a period after it was expected, before the timer stands in for it.
+/// A frame may come this late, in parts of a period after it was expected, before the timer replaces it.
 const GRACE: f64 = 0.3;
 /// The timer's tick comes at the latest so long after its step's window has opened, in periods. What is left of the
 /// window is for a thread that wakes up late.
@@ -94,7 +93,7 @@ impl Pacer {
         }
     }
 
-    /// To be told of each tick: its start, and when its frame was ready.
+    /// Takes the start of each tick, and the time at which its frame was ready.
     pub(crate) fn ticked(&mut self, start_ns: i64, ready_ns: Option<i64>) {
         self.last_ns = start_ns;
         self.expected_ns = ready_ns.unwrap_or(self.expected_ns) + self.period_ns;
@@ -122,7 +121,7 @@ mod tests {
         closest_ns: i64,
     }
 
-    /// Ten minutes of frames at these times; says what became of them.
+    /// Ten minutes of frames at these times; returns the fate of each.
     fn pace(frames: impl Iterator<Item = i64>) -> Paced {
         pace_beside(P, frames)
     }
@@ -233,7 +232,7 @@ mod tests {
                     frames.sort_unstable();
                     let paced = pace(frames.into_iter());
                     let what = format!("{late} {first_ns} {ppm}");
-                    // One beside the late frame, one where the drift leaves a window.
+                    // One next to the late frame, one as the drift leaves a window.
                     assert!(paced.waited <= 2, "{what}: {} frames waited", paced.waited);
                     assert!(paced.longest_wait_ns <= P / 4, "{what}");
                     assert!(paced.without_frame <= 5 && paced.unused <= 5, "{what}");

@@ -1,7 +1,7 @@
 //! Real time asked of the operating system, and an honest account of what was obtained.
 //!
-//! Each grant (policy and priority, CPU, locked memory) is asked for, then read back. What was refused becomes a line
-//! of [`Conditions::degraded`], which is printed beside every timing figure.
+//! Each grant (policy and priority, CPU, locked memory) is asked for, then read back. Each refusal becomes a line of
+//! [`Conditions::degraded`], which is printed with every timing figure.
 
 use crate::latency::Latency;
 use cellpos_rig::clock::{monotonic_ns, sleep_until_ns};
@@ -36,9 +36,8 @@ impl Request {
         }
     }
 
-    /// What the threads around it ask for: a FIFO priority below control, on control's CPU. What a frame sets off is one thing
-    /// after the other, and to wake a thread on another CPU takes an interrupt between the two: 0.2 to 0.4 ms where that CPU
-    /// sleeps and the machine is a virtual one, 1 us on the same CPU.
+    /// What the threads around it ask for: a FIFO priority below control, on control's CPU. A frame wakes one thread after the other.
+    /// Waking a thread on another CPU takes an interrupt: 0.2 to 0.4 ms if that CPU sleeps on a virtual machine, 1 us on the same CPU.
     pub fn io_thread(priority: u8) -> Self {
         Self {
             fifo_priority: Some(priority),
@@ -76,7 +75,7 @@ pub struct Conditions {
     pub governor: String,
     /// CPUs isolated from the scheduler at boot; empty for none.
     pub isolated: String,
-    /// What was asked for and not obtained, or is known to spoil timing: one sentence each.
+    /// Requests that were refused, and conditions that are known to spoil timing: one sentence each.
     pub degraded: Vec<String>,
 }
 
@@ -99,7 +98,7 @@ fn first_line(path: &str) -> Option<String> {
 /// Applies a request to the calling thread and says what was obtained.
 pub fn apply(request: &Request) -> Conditions {
     let mut degraded = Vec::new();
-    // Counted before this thread is pinned to one of them.
+    // Counted before this thread is pinned to one CPU.
     let cpus = allowed_cpus().len().max(1);
     if let Some(priority) = request.fifo_priority {
         let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
@@ -193,7 +192,7 @@ fn kernel() -> String {
 /// A bare absolute-sleep loop at 1 kHz on the calling thread: its wake-up latencies and the periods it missed. `woken` hears
 /// how late each wake-up was, ns.
 ///
-/// It is the yardstick beside every timing of the real loop: stalls seen here are the machine's own.
+/// It is the yardstick for every timing of the real loop: stalls seen here are the machine's own.
 pub fn bare_loop(duration: Duration, mut woken: impl FnMut(u64)) -> (Latency, u64) {
     bare_loop_while(duration, |late_ns| {
         woken(late_ns);

@@ -1,15 +1,14 @@
-//! The recorder's side of the rings: what a run leaves behind, handed to the sink.
+//! The recorder's side of the rings: hands the records of a run to the sink.
 //!
-//! One `Recorder` serves every driver: on a thread of its own in real time, between the ticks on the virtual clock. A
-//! round takes a bounded number of records, then a bounded number of events, so that neither can starve the other.
-//! Events of one kind beyond [`EVENTS_A_SECOND`] in a second of the run are counted and told as one, so that a camera that
-//! doubles every frame does not fill the disk with the news.
+//! One `Recorder` serves every driver: on its own thread in real time, between the ticks on the virtual clock. A round takes a bounded
+//! number of records, then a bounded number of events, so that neither can starve the other. More events of one kind than
+//! [`EVENTS_A_SECOND`] in a second of the run are counted and reported as one. A camera that doubles every frame does not fill the disk
+//! with events.
 //!
-//! A sink that panics, that has been refusing for longer than [`REFUSED_NS`], that does not come back from a call
-//! (`Pulse`), or whose disk has not confirmed anything for [`Unconfirmed::LIMIT`] is a fault of the run
-//! ([`RecorderFault`]): the bead is frozen and the PZT parked, because a measurement that nobody keeps is worth nothing.
-//! The rings are drained all the same and every record that found no taker is counted. A disk that is merely slow is told
-//! ([`Unconfirmed::SAID`]) and left to its work.
+//! A sink that panics, that refuses for longer than [`REFUSED_NS`], that does not return from a call (`Pulse`), or whose disk has confirmed
+//! nothing for [`Unconfirmed::LIMIT`] is a fault of the run ([`RecorderFault`]). The bead is frozen and the PZT parked, because a
+//! measurement that nobody keeps is worth nothing. The rings are drained all the same and every record that found no taker is counted. A
+//! slow disk is reported ([`Unconfirmed::SAID`]) and left to its work.
 
 use crate::life::{Event, EventKind};
 use crate::operator::Operator;
@@ -26,7 +25,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
-/// Events of one kind that are told one by one in a second of the run.
+/// Events of one kind that are reported singly in a second of the run.
 pub const EVENTS_A_SECOND: u64 = 20;
 /// How long a sink may refuse before the run is taken for unrecorded, ns.
 pub const REFUSED_NS: i64 = 500_000_000;
@@ -36,7 +35,7 @@ const RECORDS_A_ROUND: usize = 2048;
 /// Most events in a round.
 const EVENTS_A_ROUND: usize = 512;
 
-/// Beats while the recorder comes back from what it calls.
+/// Beats as long as the recorder returns from its calls.
 #[derive(Debug, Default)]
 pub(crate) struct Pulse {
     beats: AtomicU64,
@@ -66,8 +65,8 @@ pub(crate) struct PulseWatch {
 impl PulseWatch {
     /// No beat for so long is a recorder that is stuck, ns.
     pub(crate) const STUCK_NS: i64 = 900_000_000;
-    /// A look that comes later than this after the one before it says nothing of the time between: the whole program, or the
-    /// machine, may have stood still. ns.
+    /// A look that comes later than this after the one before it says nothing about the time between, ns: the whole program, or the
+    /// machine, may have stood still.
     const LOOK_NS: i64 = 10_000_000;
 
     /// Whether the recorder is stuck; to be asked in each tick.
@@ -88,8 +87,8 @@ impl PulseWatch {
     }
 }
 
-/// Watches what the disk has not confirmed: tells that it is slow, and that it is well again after [`DiskWatch::CALM_NS`], so
-/// that a disk on the edge is no news each second.
+/// Watches the data that the disk has not confirmed. Reports a slow disk, and its recovery after [`DiskWatch::CALM_NS`], so that a disk on
+/// the edge is not reported every second.
 #[derive(Debug, Clone, Copy, Default)]
 struct DiskWatch {
     /// When it was last slow, and the longest since it was first told, ms.
@@ -142,7 +141,7 @@ struct Seen {
     kind: Discriminant<EventKind>,
     since_ns: i64,
     count: u64,
-    /// The last one that was not told by itself.
+    /// The last event that was not reported singly.
     held: Option<Event>,
 }
 
@@ -179,7 +178,7 @@ impl Limiter {
         }
     }
 
-    /// Tells by number what is held back since a second, or all of it.
+    /// Reports the number of events that were held back for a second, or of all.
     fn overdue(&mut self, now_ns: Option<i64>, sink: &mut impl RunSink) {
         for seen in &mut self.seen {
             if now_ns.is_none_or(|now_ns| now_ns - seen.since_ns >= Self::SECOND_NS) {
@@ -278,7 +277,7 @@ impl<'a, S: RunSink> Recorder<'a, S> {
         more
     }
 
-    /// What the disk has not confirmed is told while it may still come to it, and is a fault when it does not.
+    /// Unconfirmed data is reported while the disk may still confirm it, and is a fault when it does not.
     fn look_at_the_disk(&mut self, now_ns: i64) {
         let unconfirmed = self.sink.unconfirmed();
         let kept = self.taken.saturating_sub(unconfirmed.rows);

@@ -4,7 +4,7 @@ use crate::ticker::RingSizes;
 use cellpos_vision::FixQuality;
 use rtrb::{Producer, RingBuffer};
 
-/// What the loop's end of the rings is in a run.
+/// The loop's end of the rings, as in a run.
 struct Loop {
     records: Producer<TickRecord>,
     events: Producer<Event>,
@@ -49,7 +49,7 @@ impl Loop {
     }
 }
 
-/// What a sink was told, in order.
+/// The calls to a sink, in order.
 #[derive(Debug, PartialEq)]
 enum Told {
     Tick(u64),
@@ -126,7 +126,7 @@ fn equal_events_are_told_by_number_and_none_is_forgotten() {
     }
     assert_eq!(told, 3001);
     assert!(lines <= 3 * (EVENTS_A_SECOND + 1) + 1, "{lines} lines");
-    // What is rare is told by itself, however often something else comes.
+    // A rare event is reported singly, however often another kind comes.
     assert!(sink.told.contains(&Told::Event(3000)));
     assert!(
         sink.told

@@ -57,11 +57,11 @@ impl RecorderFault {
     }
 }
 
-/// What a sink has been given and cannot promise to keep: the disk has not said that it has it. A program that dies loses
-/// nothing of what was written, but a power failure would.
+/// Data that a sink has taken and cannot promise to keep: the disk has not confirmed it. A program that dies loses nothing of what was
+/// written, but a power failure would.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Unconfirmed {
-    /// How long the disk has been asked to confirm it without an answer to anything; zero where none is waited for.
+    /// How long the disk has not answered any request to confirm it; zero if no request is open.
     pub since: Duration,
     /// Rows.
     pub rows: u64,
@@ -70,8 +70,8 @@ pub struct Unconfirmed {
 impl Unconfirmed {
     /// A wait that is said: a sync of half a second is a slow disk that does its work.
     pub const SAID: Duration = Duration::from_millis(900);
-    /// A wait that ends the run: as long as a file system leaves unwritten what no program asks it to sync (the commit
-    /// interval of ext4 is 5 s), and twice what the commit of a journal takes on a busy disk.
+    /// A wait that ends the run. A file system leaves data unwritten for as long if no program asks it to sync (the commit interval of ext4
+    /// is 5 s), and a busy disk commits its journal in half of that.
     pub const LIMIT: Duration = Duration::from_secs(5);
 }
 

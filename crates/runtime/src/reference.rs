@@ -1,14 +1,13 @@
 //! Who says, tick by tick, where the bead is to be.
 //!
-//! Every [`Reference`] is a reference generator: a function of the time since the loop was closed. A script is one with a state: its
-//! clock stands still while the bead is frozen or a condition is waited for, and it ends by itself. It is asked
-//! in the tick, so it allocates nothing, takes no lock and cannot panic; what it answers depends on what it was told
-//! and on nothing else, so that a run replays to the bit.
+//! Every [`Reference`] is a reference generator: a function of the time since the loop was closed. A script is a generator with a state:
+//! its clock stands still while the bead is frozen or the script waits for a condition, and it has an end. The tick calls it, so it
+//! allocates nothing, takes no lock and cannot panic. Its answer depends on its inputs alone, so that a run replays to the bit.
 
 use cellpos_control::{Reference, fill_preview};
 use serde::Serialize;
 
-/// What a reference generator is told at a tick.
+/// Input of a reference generator at a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReferenceInput {
     /// Whether the loop is closed.
@@ -31,7 +30,7 @@ pub struct ReferenceInput {
     pub target_um: Option<f64>,
 }
 
-/// What a script is doing.
+/// Activity of a script.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[repr(u8)]
@@ -39,7 +38,7 @@ pub enum Stage {
     /// There is no script, or the loop is not closed.
     #[default]
     None = 0,
-    /// The bead is on its way to where the script begins or goes on.
+    /// The bead is on its way to the place at which the script begins or continues.
     Approach = 1,
     /// By the plan.
     Running = 2,
@@ -115,7 +114,7 @@ pub struct ReferenceOutput {
     pub reference_um: f64,
     /// Time of the plan, ns; -1 without a script.
     pub plan_ns: i64,
-    /// What the script is doing.
+    /// Activity of the script.
     pub stage: Stage,
     /// Phase of a periodic reference in cycles, `None` while it is not periodic: what learning is laid on. The same
     /// motion must have the same phase each time, and the phase must advance by the same amount at each tick.
@@ -158,7 +157,7 @@ impl<R: Reference> ReferenceGenerator for R {
     }
 }
 
-/// A position that the operator may move while the run goes on.
+/// A position that the operator may move during the run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Steered {
     target_um: f64,

@@ -1,4 +1,4 @@
-//! The reference at the time of an exposure: what the error of a position is counted from.
+//! The reference at the time of an exposure: the error of a position is counted from it.
 
 /// Ticks that are remembered: an exposure that is older has no error. The loop refuses frames long before (`timing.oldest_ms`).
 const TICKS: usize = 128;
@@ -33,7 +33,7 @@ impl ReferenceHistory {
         self.count = (self.count + 1).min(TICKS);
     }
 
-    /// The reference at a time, um: on the line between the ticks before and after it, that of the newest tick later on; NaN
+    /// The reference at a time, um: on the line between the ticks before and after it; after the newest tick, that of the newest tick; NaN
     /// before the oldest tick that is remembered.
     pub fn at(&self, time_ns: i64) -> f64 {
         let mut after: Option<(i64, f64)> = None;

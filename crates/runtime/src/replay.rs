@@ -1,8 +1,8 @@
 //! A recorded run through its loop again.
 //!
-//! A record holds everything that a tick was given, so a run can be repeated from its first tick on and every command
-//! compared to the bit. The loop's own state is not recorded: a gap (records lost because the recorder ring was full, or a
-//! damaged file) is the end of a replay, and [`Outcome::gap`] says where. What stands behind it is counted, not compared.
+//! A record holds everything that a tick was given, so a run can be repeated from its first tick on and every command compared to the bit.
+//! The loop's own state is not recorded. So a replay ends at a gap (records lost because the recorder ring was full, or a damaged file),
+//! and [`Outcome::gap`] says where. Later ticks are counted, not compared.
 
 use crate::board_watch::BoardTrouble;
 use crate::core::{Core, TickInput, TickOutput};
@@ -221,7 +221,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
                 applied_um: record.partner_applied_um,
             }),
         request: Request::from_number(record.request),
-        // A reference that can be steered was told just this; the others do not listen.
+        // A reference that can be steered took just this; the others ignore it.
         target_um: Some(record.target_um).filter(|um| um.is_finite()),
         solver: SolverTerms::Recorded(
             SolverStatus::from_number(record.solver_status),

@@ -1,4 +1,4 @@
-//! What both drivers share: the recorder's sink, when a run ends, and how the actuator is served.
+//! Shared by both drivers: the recorder's sink, the end of a run, and the service of the actuator.
 
 use crate::core::CoreError;
 use crate::life::{Event, Life, Request};
@@ -10,23 +10,22 @@ use cellpos_control::{LearnedTable, LearnerState};
 use cellpos_rig::{Actuator, ActuatorError, CameraError};
 use std::time::Duration;
 
-/// Where records and events go. Called on the recorder thread; may block, allocate and fail in its own way: a sink that
-/// cannot write counts what it loses and says so ([`RunSink::is_refused`]), and the run is frozen and parked. A sink never
-/// waits for a terminal.
+/// Where records and events go. Called on the recorder thread; may block, allocate and fail. A sink that cannot write counts its losses and
+/// says so ([`RunSink::is_refused`]), and the run is frozen and parked. A sink never waits for a terminal.
 pub trait RunSink: Send {
     /// One tick.
     fn tick(&mut self, record: &TickRecord);
     /// One event.
     fn event(&mut self, event: &Event);
-    /// The sink that this one hands on to, for one that stands before another: what it does not look at itself goes there.
+    /// The next sink, if this one is in front of another: everything that it does not look at goes there.
     fn inner(&self) -> Option<&dyn RunSink> {
         None
     }
-    /// The same, to be told.
+    /// The same, mutable.
     fn inner_mut(&mut self) -> Option<&mut dyn RunSink> {
         None
     }
-    /// Events of one kind that came too often to be told one by one: the last of them, and how many there were.
+    /// Events of one kind that came too often to be reported singly: the last one, and their number.
     fn repeated(&mut self, last: &Event, count: u64) {
         match self.inner_mut() {
             Some(inner) => inner.repeated(last, count),
@@ -44,12 +43,11 @@ pub trait RunSink: Send {
     fn is_ready(&self) -> bool {
         self.inner().is_none_or(RunSink::is_ready)
     }
-    /// Whether what it was given last could not be kept: a full disk, a folder that is gone. Asked some hundred times a
-    /// second.
+    /// Whether its last data could not be kept: a full disk, a folder that is gone. Asked some hundred times a second.
     fn is_refused(&self) -> bool {
         self.inner().is_some_and(RunSink::is_refused)
     }
-    /// What it was given and the disk has not confirmed. Asked some hundred times a second.
+    /// Data that it has taken and the disk has not confirmed. Asked some hundred times a second.
     fn unconfirmed(&self) -> Unconfirmed {
         self.inner()
             .map_or_else(Unconfirmed::default, RunSink::unconfirmed)
@@ -107,7 +105,7 @@ pub enum RunError {
          the last {unkept} are lost or were never confirmed by the disk"
     )]
     RecorderHangs {
-        /// How long it was waited for without a sign of it, s.
+        /// How long the program waited without a sign of it, s.
         waited_s: u64,
         /// Rows of the run.
         ticks: u64,
@@ -223,7 +221,7 @@ pub struct Finished<S> {
     pub learned: Vec<Option<LearnedTable>>,
     /// How the recording went.
     pub recorder: RecorderReport,
-    /// What went wrong on an I/O thread, if anything did; the loop has seen it as silence and acted on it.
+    /// The failure of an I/O thread, if one failed; the loop has seen it as silence and acted on it.
     pub io_error: Option<RunError>,
 }
 
@@ -231,7 +229,7 @@ pub struct Finished<S> {
 mod tests {
     use super::*;
 
-    /// Counts what it is told, and takes nothing.
+    /// Counts its calls, and keeps nothing.
     #[derive(Default)]
     struct Told {
         repeated: u64,

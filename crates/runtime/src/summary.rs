@@ -1,4 +1,4 @@
-//! What a run amounts to: errors, losses and timing, gathered as the records go by.
+//! Summary of a run: errors, losses and timing, gathered from the records as they pass.
 
 use crate::core::Counts;
 use crate::keeping::{Hold, KeepWatch, Kept};
@@ -157,8 +157,8 @@ impl Statistics {
         if let Some(before) = &self.last {
             self.plan.add(before, record);
         }
-        // A bead that the operator froze is not being held on its reference: what it wanders is no error of the loop. The same way
-        // back as after closing the loop when it goes on. A bead that was not seen is no less far off for that.
+        // A bead that the operator froze is not held on its reference: its wandering is no error of the loop. When the run continues, the
+        // errors start as they do after the loop was closed. A bead that was not seen is no less far off for that.
         let held = KeepWatch::is_held(record);
         if held {
             if !self.held && self.running_since_ns.is_some() {
@@ -312,8 +312,8 @@ impl EndState {
     }
 }
 
-/// The figures of a run. Errors count from two seconds after the loop was closed (or went on after a freeze by the operator) until
-/// the PZT parks, moments without a fix among them; `None` where there is nothing to say.
+/// The figures of a run. Errors count from two seconds after the loop was closed, or resumed after a freeze by the operator, until the PZT
+/// parks. Moments without a fix count; `None` where there is nothing to say.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
     /// State in which the run ended: `running` unless something went wrong.
@@ -324,7 +324,7 @@ pub struct Summary {
     pub safe_reason: Option<SafeReason>,
     /// From the start of the run, before the first frame, to the end of the last tick, s.
     pub duration_s: f64,
-    /// How far the time of the plan (script) is off the clock's, percent; `None` without a plan, or less than a second of it.
+    /// Deviation of the plan's (script's) time from the clock's, percent; `None` without a plan, or less than a second of it.
     pub plan_off_percent: Option<f64>,
     /// Losses and limits by kind.
     #[serde(flatten)]
@@ -351,7 +351,7 @@ pub struct Summary {
     pub fix_noise_nm: Option<f64>,
     /// The move to the first reference; `None` when the bead was there already.
     pub step: Option<StepResult>,
-    /// What was known of gain and delay of the plant at the end, and what the loop was tuned to; `None` where it does not adapt.
+    /// The estimate of the plant's gain and delay at the end, and the tuning of the loop; `None` where it does not adapt.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub adaptation: Option<Adaptation>,
     /// Median loop delay: exposure to command, and half a period of hold, ms.
@@ -401,7 +401,7 @@ impl Summary {
         Self { adaptation, ..self }
     }
 
-    /// Joins what the control thread and the records say.
+    /// Joins the accounts of the control thread and of the records.
     pub fn new(
         life: Life,
         safe_reason: Option<SafeReason>,

@@ -1,5 +1,5 @@
-//! What each thread of a run does, a round at a time: the threads themselves only wait in between ([`crate::live`]), so
-//! that a test can run the same rounds on a clock of its own, in any order.
+//! The work of each thread of a run, one round at a time. The threads themselves only wait in between ([`crate::live`]), so a test can run
+//! the same rounds on its own clock, in any order.
 
 use crate::core::{Action, Counts};
 use crate::life::{Life, SafeReason};
@@ -18,7 +18,7 @@ use rtrb::{Consumer, Producer};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-/// What the threads tell each other besides what is in the rings.
+/// Flags that the threads share in addition to the rings.
 #[derive(Debug, Default)]
 pub(crate) struct Shared {
     /// The run is over.
@@ -77,8 +77,7 @@ impl<'a> Seeing<'a> {
         self.shared.stop.load(Ordering::Acquire) || self.measurements.is_abandoned()
     }
 
-    /// Throws away the frames that piled up before the run; vision that is slower than the camera never sees the end of
-    /// them, so not for ever.
+    /// Throws away the frames that piled up before the run. Vision that is slower than the camera would never finish, so this has an end.
     pub(crate) fn clear(&mut self) -> Result<(), RunError> {
         let until_ns = self.clock.now_ns().saturating_add(Self::CLEAR_NS);
         while !self.is_over() && self.clock.now_ns() < until_ns {
@@ -268,7 +267,7 @@ impl<'a> Acting<'a> {
         }
     }
 
-    /// Carries out what waits and reads what the board says; whether the run is over.
+    /// Carries out the waiting orders and reads the board's reports; returns whether the run is over.
     pub(crate) fn round(&mut self) -> bool {
         // Asked first: what was ordered before control ended is still carried out below.
         let over = self.orders.is_abandoned();

@@ -1,4 +1,4 @@
-//! What a tick is given and gives, and its account.
+//! Input, output and account of a tick.
 
 use crate::board_watch::BoardTrouble;
 use crate::frames::FrameTally;
@@ -8,7 +8,7 @@ use cellpos_control::SolverTerms;
 use cellpos_rig::{ActuatorReport, CommandAccount, Measurement, PartnerReport};
 use serde::Serialize;
 
-/// What a tick is given by its driver.
+/// Input of a tick, from its driver.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TickInput {
     /// Start of the tick since the start of the run, ns.
@@ -39,18 +39,18 @@ pub struct TickInput {
     pub solver: SolverTerms,
 }
 
-/// What the actuator thread tells the loop.
+/// Reports of the actuator thread to the loop.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Heard {
     /// The newest report, if one came.
     pub report: Option<ActuatorReport>,
     /// The newest report of the slow partner, if one came.
     pub partner: Option<PartnerReport>,
-    /// What became of the commands so far, where the actuator says so.
+    /// The fate of the commands so far, if the actuator reports it.
     pub account: CommandAccount,
 }
 
-/// What the actuator thread is to do.
+/// Order for the actuator thread.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Action {
     /// Hand this command to the board.
@@ -71,7 +71,7 @@ pub enum Action {
 pub struct TickOutput {
     /// What to do.
     pub action: Action,
-    /// Command for the slow partner, um of its own scale, if one is due.
+    /// Command for the slow partner, um on the partner's scale, if one is due.
     pub partner_um: Option<f64>,
     /// The record, less what only the driver knows (wake-up, compute time, late, ring full).
     pub record: TickRecord,
@@ -100,7 +100,7 @@ pub struct Counts {
     pub future: u64,
     /// Frames that came earlier than expected by more than half a tick.
     pub early: u64,
-    /// Times that the camera began to count its frames anew.
+    /// How often the camera restarted its count of frames.
     pub camera_restarts: u64,
     /// Frames that never came, each counted once.
     pub frames_lost: u64,

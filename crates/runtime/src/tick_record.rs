@@ -14,7 +14,7 @@ impl TickFlags {
     pub const TIMER: u32 = 1 << 0;
     /// The command was handed over later than the tick's budget.
     pub const LATE: u32 = 1 << 1;
-    /// Frames came, and none of them was new: repeated, older than allowed, or stamped with a time that had not come.
+    /// Frames came, but no new one: repeated, older than allowed, or stamped with a time in the future.
     pub const STALE: u32 = 1 << 2;
     /// At least one frame id is missing before this one.
     pub const DROPPED_FRAME: u32 = 1 << 3;
@@ -45,7 +45,7 @@ impl TickFlags {
 
     /// The frame came earlier than expected by more than half a tick: the model behind the loop has another delay.
     pub const EARLY: u32 = 1 << 16;
-    /// The board talks, and does not do what it is told.
+    /// The board reports, and does not obey.
     pub const BOARD_TROUBLE: u32 = 1 << 17;
     /// No frame was to come in this tick: the loop is faster than its camera.
     pub const BETWEEN: u32 = 1 << 18;
@@ -112,10 +112,9 @@ pub struct TickRecord {
     pub target_um: f64,
     /// Measured position less the reference at the exposure of its frame, um; NaN without a good position.
     pub error_um: f64,
-    /// Time of the script's plan, ns; stands still while a condition is waited for or the bead is frozen; -1 without a
-    /// script.
+    /// Time of the script's plan, ns; -1 without a script. It stands still while the script waits for a condition or the bead is frozen.
     pub plan_ns: i64,
-    /// What the script is doing (number of [`crate::Stage`]).
+    /// Activity of the script (number of [`crate::Stage`]).
     pub stage: u8,
     /// Measured length of the cell, um.
     pub length_um: f64,
@@ -147,9 +146,9 @@ pub struct TickRecord {
     pub board: u8,
     /// Latched fault that the board last reported (number of the link's fault; 0: none).
     pub board_fault: u8,
-    /// Command of the slow partner in force, um of its own scale; NaN without one.
+    /// Command of the slow partner in force, um on the partner's scale; NaN without one.
     pub partner_command_um: f64,
-    /// Where the slow partner said last that it stands, um of its own scale.
+    /// Newest reported position of the slow partner, um on the partner's scale.
     pub partner_applied_um: f64,
     /// Effect of the slow partner on the flow as the loop reckons it, um of PZT.
     pub partner_effect_um: f64,

@@ -40,7 +40,7 @@ impl<R: ReferenceGenerator> Core<R> {
         if self.state.life != Life::Running {
             return;
         }
-        /// A gap shorter than this is the daily bread of a camera and no event of its own.
+        /// Cameras leave shorter gaps all the time: they are no event.
         const WORTH_AN_EVENT: u32 = 3;
         let coasts = self.state.missing >= WORTH_AN_EVENT
             || (self.state.coasting_since_ns.is_some() && self.state.missing > 0);
@@ -77,7 +77,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let sure_ns = *state.stuck_since_ns.get_or_insert(tick.time_ns) + OBEYED_NS;
         let obeyed_ns = match state.board {
             Some(board) if board.last_seq.is_some() => board.last_time_us.saturating_mul(1000),
-            // A board that does not say what it obeys.
+            // A board whose reports name no command.
             _ => tick.time_ns.unsigned_abs(),
         };
         if !told && i64::try_from(obeyed_ns).is_ok_and(|ns| ns >= sure_ns) {
@@ -206,7 +206,7 @@ impl<R: ReferenceGenerator> Core<R> {
         }
     }
 
-    /// What the board is told.
+    /// The command for the board.
     pub(super) fn action(&mut self, output: &LoopOutput, index: u64) -> Action {
         /// Periods after which an order to park that the board has not confirmed is given again.
         const REPEAT: u64 = 10;

@@ -15,7 +15,7 @@ use cellpos_vision::Decision;
 impl<R: ReferenceGenerator> Core<R> {
     /// Accounts for ticks that never came: the last command was held, the bead moved on, and so did the plan.
     pub(super) fn catch_up(&mut self, tick: &mut Tick) {
-        /// A loop that stood still for longer has lost sight of the bead; its board has parked by itself.
+        /// A loop that stood still for longer has lost sight of the bead; its board's watchdog has parked the PZT.
         const LONGEST_NS: i64 = 1_000_000_000;
         let skipped = tick.steps - 1;
         if skipped == 0 {
@@ -196,7 +196,7 @@ impl<R: ReferenceGenerator> Core<R> {
         }
     }
 
-    /// What the driver says of the previous tick.
+    /// The driver's account of the previous tick.
     pub(super) fn check_driver(&mut self, input: &TickInput, tick: &mut Tick) {
         match input.previous_late_ns {
             Some(compute_ns) => {
@@ -232,7 +232,7 @@ impl<R: ReferenceGenerator> Core<R> {
         }
     }
 
-    /// What the board says, or its silence.
+    /// The board's report, or its silence.
     pub(super) fn check_board(&mut self, input: &TickInput, tick: &mut Tick) {
         if let Some(trouble) = input.board_trouble {
             tick.flags.set(TickFlags::BOARD_TROUBLE);

@@ -20,7 +20,7 @@ const BLIND: [FreezeReason; 4] = [
     FreezeReason::NotFollowing,
 ];
 
-/// The reasons for which the bead is frozen at present: it goes on when the last is gone.
+/// The reasons for which the bead is frozen at present. Control resumes when the last one is gone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct FreezeReasons(u8);
 
@@ -54,7 +54,7 @@ impl<R: ReferenceGenerator> Core<R> {
         i64::from(self.timing.lost_ticks) * self.timing.period_ns()
     }
 
-    /// Life cycle; gives what the controller is to do.
+    /// Life cycle; returns the controller's task.
     pub(super) fn advance_life(
         &mut self,
         position_um: Option<f64>,
@@ -62,7 +62,7 @@ impl<R: ReferenceGenerator> Core<R> {
         tick: &mut Tick,
     ) -> Mode {
         if self.state.life == Life::Armed && request.stops() {
-            // The pulse ends here; should the loop go on, it begins anew.
+            // The pulse ends here. If the loop continues, it starts again.
             self.state.arming = ArmingState::default();
             tick.flags.set(TickFlags::FREEZE);
             return Mode::Freeze;
@@ -153,7 +153,7 @@ impl<R: ReferenceGenerator> Core<R> {
             }
             (Life::Running, true) => {
                 tick.flags.set(TickFlags::FREEZE);
-                // With the bead in view the estimate of the zero flow goes on and is the best there is.
+                // With the bead in view the estimate of the zero flow continues, and nothing is better known.
                 if BLIND.into_iter().any(|reason| frozen.has(reason)) {
                     Mode::Direct(self.state.rest_um)
                 } else {

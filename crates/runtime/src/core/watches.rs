@@ -34,7 +34,7 @@ impl Pauses {
 }
 
 impl<R: ReferenceGenerator> Core<R> {
-    /// What the newest fix says of the zero flow at which a PZT would stop.
+    /// The newest fix and the zero flow at which a PZT would stop.
     pub(super) fn watch_rest(
         &mut self,
         fix: Option<LoopMeasurement>,

@@ -1,6 +1,5 @@
-//! The threads' rounds on clocks that bend: a scheduler that runs them in any order, with stalls, bursts, early, late, lost,
-//! doubled and false frames, slow vision, a slow disk and threads that die. The board is the firmware's own, and every step of
-//! its output is looked at.
+//! The threads' rounds on clocks that bend. A scheduler runs them in any order, with stalls, bursts, early, late, lost, doubled and false
+//! frames, slow vision, a slow disk and threads that die. The board is the firmware's own, and every step of its output is looked at.
 
 use super::*;
 use crate::arming::ArmingConfig;
@@ -62,7 +61,7 @@ fn core<R: ReferenceGenerator>(reference: R, first_um: f64) -> Core<R> {
     .expect("a loop")
 }
 
-/// Nothing of what a run must keep to, whatever happens, is broken.
+/// Asserts every rule that a run must keep in all conditions.
 fn check(ran: &Ran, faults: &Faults) {
     let limits = file().limits;
     // The board's converter rounds to steps of 0.6 nm.
@@ -108,7 +107,7 @@ fn check(ran: &Ran, faults: &Faults) {
     {
         assert_ne!(ran.fault, Some(RecorderFault::Unconfirmed));
     }
-    // The board of these runs does what it is told, unless it is deaf.
+    // The board of these runs obeys, unless it is deaf.
     let blamed = [
         SafeReason::BoardForeign,
         SafeReason::BoardNotObeying,

@@ -1,4 +1,4 @@
-//! The rig of these tests, and what goes wrong with it.
+//! The rig of these tests, and its faults.
 
 use super::*;
 
@@ -40,13 +40,13 @@ pub(super) struct Faults {
     pub(super) jitter_ns: (i64, i64),
     pub(super) stale: f64,
     pub(super) future: f64,
-    /// Exposed later than it should have been for when it arrives: the camera path is shorter than the loop was told.
+    /// The exposure is late for its time of arrival: the camera path is shorter than the loop's setting.
     pub(super) early: f64,
     /// The camera keeps its frames from a time on, and delivers them at once at another, ns.
     pub(super) burst: Option<(i64, i64)>,
     /// Number of the first tick, of the first frame and of the first command.
     pub(super) first: (u64, u64, u32),
-    /// The camera counts anew at this frame.
+    /// The camera restarts its count at this frame.
     pub(super) restarts_at: Option<u64>,
     pub(super) vision_ns: (i64, i64),
     /// Probability that a thread is not run for a while, and how long, ns.

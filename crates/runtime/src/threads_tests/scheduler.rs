@@ -1,4 +1,4 @@
-//! The scheduler: runs the threads' rounds on clocks of their own, in any order.
+//! The scheduler: runs the threads' rounds on separate clocks, in any order.
 
 use super::*;
 
@@ -9,7 +9,7 @@ pub(super) struct Ran {
     pub(super) commands: Option<CommandAccount>,
     pub(super) io_error: Option<RunError>,
     pub(super) report: RecorderReport,
-    /// What the operator's end of the loop was told of the recorder.
+    /// News of the recorder at the operator's end of the loop.
     pub(super) fault: Option<RecorderFault>,
     pub(super) records: Vec<TickRecord>,
     pub(super) events: Vec<Event>,
@@ -19,7 +19,7 @@ pub(super) struct Ran {
     pub(super) applied_um: f64,
 }
 
-/// The threads of a run, and when each of them runs next.
+/// The threads of a run, and the time of the next round of each.
 pub(super) struct Scheduler<'a> {
     pub(super) faults: &'a Faults,
     pub(super) dice: Dice,
@@ -31,7 +31,7 @@ pub(super) struct Scheduler<'a> {
     pub(super) shared: &'a Shared,
     pub(super) operator: &'a Operator,
     pub(super) seeing: Option<Seeing<'a>>,
-    /// What the camera thread has found, until the time at which it was ready.
+    /// Results of the camera thread, until the time at which they were ready.
     pub(super) seen: Consumer<Measurement>,
     pub(super) on_its_way: VecDeque<Measurement>,
     pub(super) to_control: Option<Producer<Measurement>>,
