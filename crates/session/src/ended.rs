@@ -1,13 +1,13 @@
 //! The end of a run in sentences: observation, expectation, remedy.
 
+use crate::clues::Clues;
 use crate::failure::{Failure, describe};
-use crate::words::{is_odd, of_what_is_followed, safe_reason};
+use crate::words::{of_what_is_followed, safe_reason};
 use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
-use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
+use cellpos_runtime::life::{Refusal, SafeReason};
+use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::recorder::RecorderFault;
-use cellpos_runtime::{
-    ArmingConfig, End, EndState, Event, Kept, NotKept, RunError, Summary, Timing,
-};
+use cellpos_runtime::{ArmingConfig, End, EndState, Kept, NotKept, RunError, Summary, Timing};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -114,44 +114,6 @@ impl fmt::Display for Ended {
     }
 }
 
-/// The last event of each kind that explains the end of a run.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Clues {
-    arming: Option<(Refusal, f64, f64)>,
-    /// Gain over the model's, and half its 95 % interval, from an accepted pulse.
-    passed: Option<(f64, f64)>,
-    board: Option<(State, Fault)>,
-    late_us: Option<f64>,
-    stale_ms: Option<f64>,
-    vision_ms: Option<[f64; 2]>,
-    /// Displacement beyond which the bead does not follow, um.
-    clipped_um: Option<f64>,
-}
-
-impl Clues {
-    pub(crate) fn note(&mut self, event: &Event) {
-        match event.kind {
-            EventKind::ArmingRefused {
-                refusal,
-                gain_ratio,
-                ci95,
-            } => {
-                self.arming = Some((refusal, gain_ratio, ci95));
-            }
-            EventKind::ArmingPassed { gain_ratio, ci95 } => self.passed = Some((gain_ratio, ci95)),
-            EventKind::ActuatorClipped { level_um } => self.clipped_um = Some(level_um),
-            EventKind::BoardChanged { state, fault } => self.board = Some((state, fault)),
-            EventKind::LateTick { compute_us } => self.late_us = Some(compute_us),
-            EventKind::FrameStale { age_ms } => self.stale_ms = Some(age_ms),
-            EventKind::VisionSlowStarted {
-                vision_ms,
-                period_ms,
-            } => self.vision_ms = Some([vision_ms, period_ms]),
-            _ => {}
-        }
-    }
-}
-
 /// The expectations of the loop's set-up.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Expected {
@@ -173,19 +135,13 @@ fn sentences(seen: impl Into<String>, expected: impl Into<String>, to_do: &str) 
 }
 
 impl Clues {
-    /// Gain over the model's, if the arming pulse was accepted but the gain differs from the model's.
-    pub(crate) fn odd_gain(&self) -> Option<f64> {
-        (self.passed)
-            .filter(|(ratio, ci95)| is_odd(*ratio, *ci95))
-            .map(|(ratio, _)| ratio)
-    }
-
-    /// The end of a run, from its summary, its trouble and these clues.
+    /// The end of a run, from its summary, its trouble, the rights of its control thread and these clues.
     pub(crate) fn ended(
         &self,
         summary: &Summary,
         trouble: Option<&RunError>,
         recorder: Option<RecorderFault>,
+        conditions: &Conditions,
         expected: &Expected,
     ) -> Ended {
         let refusal = self.arming.map(|(refusal, ..)| refusal);
@@ -220,7 +176,15 @@ impl Clues {
                 "a bead held steadily in view, and time for the arming pulse",
                 "bring a bead into view, or run longer",
             ),
-            EndKind::Safe => self.safe(summary.safe_reason, expected),
+            EndKind::Safe => {
+                let (seen, wanted, to_do) = self.safe(summary.safe_reason, expected);
+                let first = self.machine(summary.safe_reason, conditions);
+                (
+                    seen,
+                    wanted,
+                    format!("{}{to_do}", first.unwrap_or_default()),
+                )
+            }
             EndKind::Operator | EndKind::Stopped => sentences("the operator ended the run", "", ""),
         };
         let said = |sentence: String| of_what_is_followed(&sentence, expected.cell);

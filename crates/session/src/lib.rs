@@ -37,6 +37,7 @@ pub mod adapt;
 #[cfg(any(feature = "page", feature = "screen"))]
 mod beside;
 pub mod clips;
+mod clues;
 pub mod connect;
 mod crop;
 pub mod cyclic;

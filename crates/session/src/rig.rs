@@ -1,7 +1,8 @@
 //! The states of a rig as types: [`Rig`] -> [`Armed`] -> [`Running`] -> [`Finished`].
 
+use crate::clues::Clues;
 use crate::devices::{Devices, Options, check_armed, session_number};
-use crate::ended::{Clues, Ended, Expected};
+use crate::ended::{Ended, Expected};
 use crate::failure::Failure;
 use crate::fit;
 use crate::fit::diffusion_um2_per_s;
@@ -439,6 +440,7 @@ where
                 &finished.summary,
                 finished.io_error.as_ref(),
                 finished.recorder.fault,
+                &finished.conditions,
                 &expected,
             ),
             rig,

@@ -1,6 +1,6 @@
 //! Collects the clues of a run's end on the way to the sink.
 
-use crate::ended::Clues;
+use crate::clues::Clues;
 use crate::words::is_odd;
 use crate::{say, words};
 use cellpos_runtime::life::EventKind;

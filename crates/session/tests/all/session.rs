@@ -253,6 +253,35 @@ fn a_wrong_sign_and_no_bead_end_with_different_words_and_different_advice() {
     assert!(nobody.to_do.contains("into view"), "{nobody}");
 }
 
+#[test]
+fn old_frames_on_a_machine_that_gives_no_priority_are_first_laid_to_the_machine() {
+    let old = |m: &mut Measurement| {
+        if m.frame_id > 700 {
+            m.mid_exposure_ns -= 50_000_000;
+        }
+    };
+    let end = |clock| {
+        let (mut rig, _) = rig(clock, old, |_| {});
+        let setup = set_up(&mut rig);
+        let core = setup.core().expect("a loop");
+        let armed = rig.arm(&setup, core, NoSink, ticks(20_000)).ok();
+        let finished = armed.expect("armed").start().and_then(|run| run.wait());
+        finished.expect("a run").ended
+    };
+    let (busy, camera) = (
+        "this machine may have been busy",
+        "check the camera's buffers",
+    );
+    let real = end(ClockKind::Real);
+    assert_eq!(real.kind, EndKind::Safe, "{real}");
+    if real.reason == Some(cellpos_runtime::life::SafeReason::StaleFrames) {
+        assert!(real.to_do.starts_with(busy), "{real}");
+        assert!(real.to_do.contains(camera), "{real}");
+    }
+    let ideal = end(ClockKind::Virtual);
+    assert!(ideal.to_do.starts_with(camera), "{ideal}");
+}
+
 /// Scheduling policy of the calling thread by number: 0 ordinary, 1 FIFO.
 fn policy() -> Option<u32> {
     let stat = std::fs::read_to_string("/proc/thread-self/stat").ok()?;
