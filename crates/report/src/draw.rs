@@ -5,7 +5,7 @@ use crate::figure::{Content, Figure, Panel};
 use crate::heat::heat_map;
 use crate::mosaic::mosaic;
 use crate::panel::{
-    Entry, Frame, LEFT_PX, RIGHT_PX, data_range, draw_panel, entries, head_px, legend,
+    Entry, Frame, LEFT_PX, RIGHT_PX, data_range, draw_panel, entries, head_px, left_px, legend,
 };
 use crate::svg::{self, SLIM_PX, STYLE, WIDTH_PX, px};
 use std::fmt::Write;
@@ -76,6 +76,7 @@ fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_p
         figure.columns.min(panels.len().max(1))
     };
     let width = width_px / columns as f64;
+    let left = panels.iter().map(left_px).fold(LEFT_PX, f64::max);
     let mut top = 4.0;
     // Do not repeat the legend of a colour.
     let mut told: Vec<Entry<'_>> = Vec::new();
@@ -83,14 +84,14 @@ fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_p
         && columns > 1
         && others.iter().all(|panel| entries(panel) == entries(first))
     {
-        let room = width_px - LEFT_PX - RIGHT_PX;
-        top += legend(drawing, first, &told, (LEFT_PX, top), room);
+        let room = width_px - left - RIGHT_PX;
+        top += legend(drawing, first, &told, (left, top), room);
         told = entries(first);
     }
     for (row_index, row) in panels.chunks(columns).enumerate() {
         let last_row = (row_index + 1) * columns >= panels.len();
         let mut tallest: f64 = 0.0;
-        let inner = width - LEFT_PX - RIGHT_PX;
+        let inner = width - left - RIGHT_PX;
         let mut of_row = told.clone();
         let mut head = 0.0_f64;
         for panel in row {
@@ -99,7 +100,8 @@ fn panels_grid(drawing: &mut Drawing, figure: &Figure, panels: &[Panel], width_p
         }
         for (column, panel) in row.iter().enumerate() {
             let frame = Frame {
-                left: column as f64 * width + LEFT_PX,
+                left: column as f64 * width + left,
+                left_px: left,
                 top,
                 width: inner,
                 head_px: head,
@@ -219,6 +221,36 @@ mod tests {
             assert!(wide.contains(class) && slim.contains(class), "{class}");
         }
         assert!(slim.contains(&format!("viewBox=\"0 0 {SLIM_PX} ")));
+    }
+
+    #[test]
+    fn long_numbers_at_an_axis_leave_its_title_free() {
+        let (x, y) = ([0.0, 1.0], [20.000_01, 20.000_31]);
+        let panel = Panel::new(Axis::linear("time", "s"), Axis::linear("PZT", "um"))
+            .series(Series::line("command", &x, &y));
+        let svg = figure(&Figure::new("f", "c").panel(panel), false, WIDTH_PX);
+        let title = svg
+            .split("<text")
+            .find(|tag| tag.contains("rotate"))
+            .unwrap();
+        let at = title.split("rotate(-90 ").nth(1).unwrap();
+        let at: f64 = at.split([' ', ',']).next().unwrap().parse().unwrap();
+        for tag in svg.split("<text").filter(|tag| tag.contains(">20.000")) {
+            let label = tag.split(['>', '<']).nth(1).unwrap();
+            let from = number(tag, "x") - text_width_px(label);
+            assert!(from > at + 6.0, "{label} begins at {from}, title at {at}");
+        }
+    }
+
+    #[test]
+    fn a_point_is_named_although_a_line_of_its_name_is() {
+        let panel = || Panel::new(Axis::linear("x", ""), Axis::linear("y", ""));
+        let (x, y) = ([1.0, 2.0], [2.0, 3.0]);
+        let shown = Figure::new("f", "c")
+            .panel(panel().series(Series::line("measured", &x, &y).color(0)))
+            .panel(panel().series(Series::points("measured", &x, &y).color(0)));
+        let svg = figure(&shown, false, WIDTH_PX);
+        assert_eq!(svg.matches(">measured<").count(), 2);
     }
 
     #[test]

@@ -12,10 +12,14 @@ pub(crate) const LEFT_PX: f64 = 82.0;
 /// Room to the right of the axes, px.
 pub(crate) const RIGHT_PX: f64 = 16.0;
 const LINE_PX: f64 = 18.0;
+/// Least distance of the numbers at the y axis, px.
+const Y_SPACING_PX: f64 = 34.0;
 
 /// Where a panel goes.
 pub(crate) struct Frame<'a> {
     pub(crate) left: f64,
+    /// Room to the left of the axes, px.
+    pub(crate) left_px: f64,
     pub(crate) top: f64,
     pub(crate) width: f64,
     pub(crate) x_range: Option<(f64, f64)>,
@@ -27,8 +31,33 @@ pub(crate) struct Frame<'a> {
     pub(crate) told: &'a [Entry<'a>],
 }
 
-/// A name, a colour and whether the stroke is dashed.
-pub(crate) type Entry<'a> = (&'a str, usize, bool);
+/// The stroke of a legend's entry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Mark {
+    Line,
+    Dot,
+    Area,
+    Bar,
+}
+
+impl Mark {
+    fn of(kind: &Kind) -> Self {
+        match kind {
+            Kind::Line { .. } | Kind::Step { .. } => Self::Line,
+            Kind::Points { .. } => Self::Dot,
+            Kind::Band { .. } => Self::Area,
+            Kind::Bars { .. } => Self::Bar,
+        }
+    }
+}
+
+/// A name, a colour, whether the stroke is dashed, and what it is: a point is not explained by a line of its name.
+pub(crate) type Entry<'a> = (&'a str, usize, bool, Mark);
+
+fn entry(series: &Series, color: usize) -> Entry<'_> {
+    let mark = Mark::of(&series.kind);
+    (series.label.as_str(), color, series.dashed, mark)
+}
 
 /// Entries of a panel's legend: names, colours and strokes.
 pub(crate) fn entries(panel: &Panel) -> Vec<Entry<'_>> {
@@ -37,7 +66,7 @@ pub(crate) fn entries(panel: &Panel) -> Vec<Entry<'_>> {
         .iter()
         .zip(colors(panel))
         .filter(|(series, _)| !series.label.is_empty())
-        .map(|(series, color)| (series.label.as_str(), color, series.dashed))
+        .map(|(series, color)| entry(series, color))
         .collect()
 }
 
@@ -83,6 +112,34 @@ pub(crate) fn data_range(panel: &Panel, along_x: bool) -> Option<(f64, f64)> {
     range
 }
 
+/// The y axis of a panel on its height, px.
+fn placed_y(panel: &Panel) -> Placed<'_> {
+    let range = data_range(panel, false);
+    let mut y = Placed::new(&panel.y, range, 0.06, panel.height_px);
+    let bars_up = panel
+        .series
+        .iter()
+        .any(|s| matches!(s.kind, Kind::Bars { .. }));
+    if bars_up && panel.y.range.is_none() && range.is_some_and(|(low, _)| low >= 0.0) {
+        y.low = if panel.y.scale == Scale::Log {
+            y.low
+        } else {
+            0.0
+        };
+    }
+    y
+}
+
+/// Room that the numbers and the title of a panel's y axis need to the left of it, px.
+pub(crate) fn left_px(panel: &Panel) -> f64 {
+    /// From the edge over the title to the numbers, and from these to the axis.
+    const AROUND_PX: f64 = 34.0;
+    let ticks = placed_y(panel).ticks(Y_SPACING_PX);
+    let labels = ticks.iter().filter_map(|tick| tick.label.as_deref());
+    let widest = labels.map(svg::text_width_px).fold(0.0, f64::max);
+    LEFT_PX.max(widest + AROUND_PX)
+}
+
 /// Height of title and legend of a panel, px.
 pub(crate) fn head_px(panel: &Panel, told: &[Entry<'_>], width: f64) -> f64 {
     let title = if panel.title.is_empty() { 0.0 } else { LINE_PX };
@@ -105,7 +162,6 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
     top = top.max(frame.top + frame.head_px) + 4.0;
 
     let (mut width, mut height) = (frame.width, panel.height_px);
-    let y_range = data_range(panel, false);
     let pad_x = if panel
         .series
         .iter()
@@ -116,18 +172,7 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
         0.0
     };
     let mut x = Placed::new(&panel.x, frame.x_range, pad_x, width);
-    let mut y = Placed::new(&panel.y, y_range, 0.06, height);
-    let bars_up = panel
-        .series
-        .iter()
-        .any(|s| matches!(s.kind, Kind::Bars { .. }));
-    if bars_up && panel.y.range.is_none() && y_range.is_some_and(|(low, _)| low >= 0.0) {
-        y.low = if panel.y.scale == Scale::Log {
-            y.low
-        } else {
-            0.0
-        };
-    }
+    let mut y = placed_y(panel);
     if panel.equal && panel.x.scale == Scale::Linear && panel.y.scale == Scale::Linear {
         (width, height) = equalise(&mut x, &mut y, frame.width, height);
     }
@@ -177,7 +222,7 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
     }
     drawing.upright(
         "",
-        (left - LEFT_PX + 16.0, top + height / 2.0),
+        (left - frame.left_px + 16.0, top + height / 2.0),
         &svg::fit(&panel.y.title(), height + 20.0),
     );
     end - frame.top
@@ -225,7 +270,7 @@ fn grid(
             drawing.text("mut", (at, bottom + 15.0), Anchor::Middle, &label);
         }
     }
-    for tick in y.ticks(34.0) {
+    for tick in y.ticks(Y_SPACING_PX) {
         let Some(at) = y.at(tick.value) else { continue };
         let class = if tick.label.is_some() { "grd" } else { "grm" };
         drawing.line(class, (left, bottom - at), (left + width, bottom - at));
@@ -323,8 +368,7 @@ pub(crate) fn legend(
         .iter()
         .zip(colors(panel))
         .filter(|(series, color)| {
-            let entry = (series.label.as_str(), *color, series.dashed);
-            !series.label.is_empty() && !told.contains(&entry)
+            !series.label.is_empty() && !told.contains(&entry(series, *color))
         })
         .collect();
     if named.is_empty() {

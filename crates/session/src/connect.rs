@@ -252,12 +252,8 @@ pub fn is_beaten(bound: f64, reached: f64, duration_s: f64) -> bool {
 /// bound.
 pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<f64> {
     let noise_nm = summary.fix_noise_nm?;
-    let timing = &setup.config.timing;
-    let measured_s = 1e-3 * summary.loop_delay_ms - 0.5e-6 * timing.period_us;
-    let delay_s = match summary.exposure_to_command_us.max > 0.0 {
-        true => measured_s.max(0.0),
-        false => timing.camera_delay_ms * 1e-3,
-    };
+    let used_ms = (summary.exposure_to_command_us.max > 0.0).then_some(summary.loop_delay_ms);
+    let delay_s = delay_of_run_s(setup, used_ms);
     let diffusion = crate::fit::diffusion_um2_per_s(file, &setup.model);
     let bound_nm = 1e3 * bound_of_um(setup, diffusion, noise_nm * 1e-3, delay_s);
     let measured_nm = |nm: f64| (nm * nm - noise_nm * noise_nm).max(0.0).sqrt();
@@ -266,18 +262,32 @@ pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<
     (!beaten).then_some(bound_nm)
 }
 
-/// The lowest possible error as people read it, nm.
-pub fn possible_text(bound_rms_nm: Option<f64>) -> String {
-    match bound_rms_nm {
-        Some(nm) => format!("{nm:.1} nm RMS (Brownian motion, loop delay, noise of these fixes)"),
-        None => "not stated: no error was measured, or it is below what the model says is possible. Then the model's diffusion or delay is \
-                 too large: identify again"
-            .to_owned(),
+/// Delay from an exposure to the command of a run, s: as the run measured it (`loop_delay_ms`, with half a period of hold in it), or, of
+/// a run that used no frame, as its rig file says.
+pub fn delay_of_run_s(setup: &Setup, loop_delay_ms: Option<f64>) -> f64 {
+    let timing = &setup.config.timing;
+    match loop_delay_ms {
+        Some(ms) => (1e-3 * ms - 0.5e-6 * timing.period_us).max(0.0),
+        None => timing.camera_delay_ms * 1e-3,
+    }
+}
+
+/// The lowest possible error as people read it, nm; `rms_nm` is the error of the run.
+pub fn possible_text(bound_rms_nm: Option<f64>, rms_nm: Option<f64>) -> String {
+    match (bound_rms_nm, rms_nm) {
+        (Some(nm), _) => {
+            format!("{nm:.1} nm RMS (Brownian motion, loop delay, noise of these fixes)")
+        }
+        (None, None) => "not stated: no error was measured".to_owned(),
+        (None, Some(_)) => {
+            "not stated: the error is below what the model says is possible. The model's diffusion or delay is too large: identify again"
+                .to_owned()
+        }
     }
 }
 
 /// The bound of a set-up's path with another camera path, um.
-pub(crate) fn bound_of_um(setup: &Setup, diffusion: f64, noise_um: f64, delay_s: f64) -> f64 {
+pub fn bound_of_um(setup: &Setup, diffusion: f64, noise_um: f64, delay_s: f64) -> f64 {
     let sample_s = setup.config.timing.period_us * 1e-6;
     let plant =
         DesignPlant::from_model(&setup.model, Some(delay_s + 0.5 * sample_s), sample_s).ok();

@@ -1,6 +1,7 @@
 //! Events of a run as sentences: for the terminal, the page and the report.
 
 use crate::adapt;
+use cellpos_rig::{ActuatorFault, ActuatorState};
 use cellpos_runtime::life::{EventKind, FreezeReason, Refusal, SafeReason};
 
 /// Importance of an event for the operator.
@@ -212,9 +213,7 @@ fn text(kind: &EventKind) -> String {
         EventKind::SaturationEnded { lasted_ms } => {
             ended("The PZT has left the end of its range", lasted_ms)
         }
-        EventKind::BoardChanged { state, fault } => {
-            format!("The board reports {state:?}, fault {fault:?}.")
-        }
+        EventKind::BoardChanged { state, fault } => board_changed(state, fault),
         EventKind::BoardHeld { count } => board_held(count),
         EventKind::PartnerLost
         | EventKind::PartnerBack { .. }
@@ -283,6 +282,27 @@ fn arming_refused(why: Refusal, gain_ratio: f64) -> String {
     } else {
         format!("Arming was refused: {why}.")
     }
+}
+
+fn board_changed(state: ActuatorState, fault: ActuatorFault) -> String {
+    let state = match state {
+        ActuatorState::Disarmed => "The board is disarmed",
+        ActuatorState::Armed => "The board is armed, and waits for the first command",
+        ActuatorState::Running => "The board follows the commands",
+        ActuatorState::Frozen => "The board holds the displacement of zero flow: frozen",
+        ActuatorState::Safe => "The board parks the PZT",
+        ActuatorState::Holding => "The board holds the displacement of zero flow",
+    };
+    let why = match fault {
+        ActuatorFault::None => "",
+        ActuatorFault::CommandTimeout => ": no command came in time",
+        ActuatorFault::FreezeTimeout => ": nothing ended a freeze",
+        ActuatorFault::ArmTimeout => ": no command followed arming",
+        ActuatorFault::Device => {
+            ": it reports a fault of temperature, current, supply or converter"
+        }
+    };
+    format!("{state}{why}.")
 }
 
 fn board_held(count: u16) -> String {

@@ -421,7 +421,7 @@ fn text(report: &Report) -> String {
     }
     line(
         "lowest possible",
-        connect::possible_text(report.bound_rms_nm),
+        connect::possible_text(report.bound_rms_nm, s.rms_measured_nm),
     );
     if let Some(step) = s.step {
         line(

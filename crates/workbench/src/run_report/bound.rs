@@ -1,11 +1,11 @@
 //! The bound that Brownian motion sets to the error.
 
 use super::ticks::Ticks;
-use cellpos_control::design::bound_rms_um;
-use cellpos_record::RunMeta;
+use cellpos_record::{RunMeta, RunReader};
 use cellpos_report::{Emphasis, Report};
 use cellpos_runtime::Hold;
 use cellpos_session::connect;
+use cellpos_session::recorded::{self, diffusion_of_run_um2_per_s};
 
 /// What Brownian motion, delay and localisation noise leave to the best controller while holding.
 #[derive(Debug)]
@@ -14,22 +14,15 @@ pub(super) struct Bound {
     pub rms_um: f64,
 }
 
-/// Diffusion of the bead, um^2/s, delay of the camera and period of the loop, s, as a run.toml has them.
-fn loop_of(meta: &RunMeta) -> Option<(f64, f64, f64)> {
+/// How well the bead of a run is to be held, if its run.toml says enough.
+pub(super) fn hold_of(meta: &RunMeta) -> Option<Hold> {
     let timing = meta.config.get("timing")?;
     let at = |key: &str| timing.get(key)?.as_float();
-    let diffusion_um2_per_s = cellpos_session::recorded::diffusion_of_run_um2_per_s(meta)?;
-    Some((
-        diffusion_um2_per_s,
+    Some(Hold::new(
+        diffusion_of_run_um2_per_s(meta)?,
         at("camera_delay_ms")? * 1e-3,
         at("period_us")? * 1e-6,
     ))
-}
-
-/// How well the bead of a run is to be held, if its run.toml says enough.
-pub(super) fn hold_of(meta: &RunMeta) -> Option<Hold> {
-    let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta)?;
-    Some(Hold::new(diffusion_um2_per_s, delay_s, period_s))
 }
 
 impl Bound {
@@ -58,12 +51,20 @@ impl Bound {
         None
     }
 
-    /// The bound of a run, if its run.toml says enough.
-    pub(super) fn of(meta: Option<&RunMeta>, ticks: &Ticks) -> Option<Self> {
-        let (diffusion_um2_per_s, delay_s, period_s) = loop_of(meta?)?;
+    /// The bound of a run, with the delay that it measured, if its run.toml says enough.
+    pub(super) fn of(run: &RunReader, ticks: &Ticks) -> Option<Self> {
+        let meta = run.meta().ok()?;
+        let setup = recorded::setup(run).ok()?;
+        let diffusion_um2_per_s = diffusion_of_run_um2_per_s(meta)?;
+        let used_ms = meta.end.as_ref().and_then(|end| {
+            let frames = end.summary.get("exposure_to_command_us")?;
+            let loop_delay_ms = end.summary.get("loop_delay_ms")?.as_float()?;
+            (frames.get("max")?.as_float()? > 0.0).then_some(loop_delay_ms)
+        });
+        let delay_s = connect::delay_of_run_s(&setup, used_ms);
         Some(Self {
             diffusion_um2_per_s,
-            rms_um: bound_rms_um(diffusion_um2_per_s, ticks.noise_um(), delay_s, period_s),
+            rms_um: connect::bound_of_um(&setup, diffusion_um2_per_s, ticks.noise_um(), delay_s),
         })
     }
 }

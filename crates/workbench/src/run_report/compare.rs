@@ -124,9 +124,10 @@ fn page(compared: &[Compared]) -> (Report, String) {
         page.figure(errors(compared));
     }
     page.section("What was run");
+    // The first line of the page has the tasks.
     let said = compared.iter().map(|run| {
-        let (name, task, started) = (&run.name, &run.task, &run.started);
-        format!("{name}: {task} {started}, {}", run.run.display())
+        let (name, started) = (&run.name, &run.started);
+        format!("{name}: {started}, {}", run.run.display())
     });
     page.list(&said.collect::<Vec<_>>());
     (page, sentence)

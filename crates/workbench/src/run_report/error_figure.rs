@@ -68,7 +68,7 @@ pub(super) fn error_figure(ticks: &Ticks, bound: Option<&Bound>, rows: &[CycleRo
         Panel::new(Axis::linear("time", "s"), Axis::linear("position", "um"))
             .series(Series::line("target", &end.time_s, &end.target_um).color(1))
             .series(
-                Series::points("measured", &end.time_s, &end.measured_um)
+                Series::points("each position", &end.time_s, &end.measured_um)
                     .color(0)
                     .thin(),
             )

@@ -85,7 +85,8 @@ pub fn one(run: &Path, out: Option<&Path>) -> Result<Written<FiguresOfOne>, Fail
     if let Some(meta) = meta {
         page.lead(&origin::lead(meta, &cycles.rows));
     }
-    let bound = bound::Bound::of(meta, ticks).and_then(|bound| bound.unbeaten(ticks, &mut page));
+    let bound =
+        bound::Bound::of(&recorded.first, ticks).and_then(|bound| bound.unbeaten(ticks, &mut page));
     let motions = load_learned(run);
     let gain = match motions.as_slice() {
         [one] => one.table.error_before_um.zip(one.table.error_after_um),

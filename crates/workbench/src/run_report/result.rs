@@ -28,6 +28,7 @@ pub(super) fn section(
     learned: Option<(f64, f64)>,
 ) -> String {
     let (status, ended) = ending(sessions);
+    let kept = ended.is_none();
     let what = origin::subject(sessions.iter().find_map(|session| session.meta.as_ref()));
     let (lost, without) = (
         counted(sessions, "frames_lost"),
@@ -39,11 +40,15 @@ pub(super) fn section(
     } = of_a_cell(rows)
         .or_else(|| of_waves(rows, bound, what))
         .or_else(|| of_cycles(rows, bound, what))
-        .or_else(|| of_a_hold(ticks, bound, what, ended.is_none()))
+        .or_else(|| of_a_hold(ticks, bound, what, kept))
         .unwrap_or_else(|| Said {
             result: "The loop was not closed long enough for an error to be stated.".to_string(),
-            sure: "nothing was measured of which it could be said.".to_string(),
+            sure: "no error was measured. What happened is in the record, and below.".to_string(),
         });
+    // How it ended comes first: the error is then that of a part.
+    if let Some(ended) = ended {
+        result.insert_str(0, &format!("The run did not end as planned: {ended}. "));
+    }
     if let Some((before_um, after_um)) = learned {
         let (before, after) = (nm(before_um), nm(after_um));
         result.push_str(&match (after_um / before_um - 1.0).abs() < LEARNED {
@@ -61,9 +66,6 @@ pub(super) fn section(
     });
     if without > 0 {
         result.push_str(&format!(" {without} frames showed no {what}."));
-    }
-    if let Some(ended) = ended {
-        result.push_str(&format!(" The run did not end as planned: {ended}."));
     }
     page.result(status, &result);
     page.certainty(&sure);
@@ -158,8 +160,9 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
     text.push('.');
     if let Some(fixed) = trend(under_load(rows).map(|row| (row.cycle, rest.stretch(row)))) {
         text.push_str(&format!(
-            " Held under a static load: stretch {}.",
-            change(&fixed)
+            " Held under a static load: stretch {}{}.",
+            change(&fixed),
+            percent(&fixed)
         ));
     }
     let mut sure = format!(

@@ -47,7 +47,7 @@ pub(super) fn page(
     page.result(status, &sentence);
     page.certainty(&format!(
         "calculated, so as sure as the model, whose own error is not in these figures; the margins say how wrong it may be before the loop is \
-         unstable: by {:.1} dB in gain or {:.2} ms in delay, one at a time. Lowest possible: what Brownian motion does to the bead within the \
+         unstable: by {:.1} dB in gain or {:.2} ms in delay, one at a time. Lowest possible: what the noise of a fix and Brownian motion do to the bead within the \
          delay, under any controller.",
         report.margins.gm_db,
         report.margins.delay_margin_s * 1e3

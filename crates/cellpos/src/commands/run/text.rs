@@ -132,7 +132,8 @@ impl<'a> Report<'a> {
         );
         line("error, all", kept::error(&self.summary.kept));
         line("held", kept::held(&self.summary.kept));
-        line("lowest possible", connect::possible_text(self.bound_rms_nm));
+        let possible = connect::possible_text(self.bound_rms_nm, self.summary.rms_measured_nm);
+        line("lowest possible", possible);
         if let Some(now) = &self.summary.adaptation {
             line("adaptation", adapt::text(now));
         }

@@ -153,9 +153,7 @@ impl Compared {
             cycles_elsewhere: rows.iter().filter(|row| was_elsewhere(row)).count(),
             rms_nm: ticks.rms_um().map(nm),
             rms_ci95_nm: ticks.rms_ci95_um().map(nm),
-            bound_rms_nm: (!ticks.target_moves)
-                .then(|| Bound::of(meta, ticks))
-                .flatten()
+            bound_rms_nm: Bound::of(&recorded.first, ticks)
                 .filter(|bound| !bound.is_beaten(ticks))
                 .map(|bound| nm(bound.rms_um)),
             ends,

@@ -83,15 +83,15 @@ pub(super) fn errors(compared: &[Compared]) -> Figure {
         Axis::linear("error", "nm RMS"),
     )
     .series(Series::intervals("measured", &at, &rms, &low, &high).color(0));
+    let mut caption = "Error of the measured position of each run while the loop was closed, with its 95 % interval where it is larger \
+                       than the point"
+        .to_owned();
     if bound.iter().any(|nm| nm.is_finite()) {
         panel = panel.series(Series::points("lowest possible", &at, &bound).color(1));
+        caption
+            .push_str(", and the lowest that Brownian motion, delay and localisation noise allow");
     }
-    Figure::new(
-        "errors",
-        "Error of the measured position of each run while the loop was closed, with its 95 % interval where it is larger than the \
-         point, and the lowest that Brownian motion, delay and localisation noise allow a bead at rest.",
-    )
-    .panel(panel)
+    Figure::new("errors", &(caption + ".")).panel(panel)
 }
 
 /// First and last cycles of every quantity of every run.
