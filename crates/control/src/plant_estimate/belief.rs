@@ -8,8 +8,8 @@
 use super::motion::{LAGS, MEMBERS};
 use std::f64::consts::LN_2;
 
-/// Step of the delays, samples: half the standard deviation that a dither of one per cent of hold error leaves after 10 s.
-const STEP: f64 = 0.25;
+/// Step of the delays, samples: that of the law's tunings.
+const STEP: f64 = 0.5;
 /// Delays beyond the design's: those between the first and the last lag of the instrument.
 pub(super) const DELAYS: usize = ((LAGS[MEMBERS - 1] - LAGS[0]) / STEP) as usize + 1;
 /// Random walk of the logarithm of a plant's gain, 1/sqrt(s). A channel that clogs to half in a quarter of an hour is then followed
@@ -20,8 +20,6 @@ const GAIN_WALK: f64 = 0.008;
 const CHANGES_PER_S: f64 = 1.0 / 3600.0;
 /// Standard deviation of the logarithm of a gain that is not known: twice and half the model's are usual.
 const GAIN_PRIOR: f64 = LN_2;
-/// Decay of the belief in a delay that nothing is known of, for a sample of distance from the design's, natural logarithm.
-const DELAY_PRIOR: f64 = 2.0;
 /// Spans of time in which the last change may have come. Neighbours that are least likely become one. With 5 or 16 of them the
 /// loop holds the same.
 const SPANS: usize = 8;
@@ -58,8 +56,7 @@ pub(super) struct Finding {
 }
 
 impl Finding {
-    /// Logarithm of the odds that the delay is longer and that it is shorter than one of the law's, samples, by half a step of the law's
-    /// at least. A delay that is half way counts as longer.
+    /// Logarithm of the odds that the delay is longer and that it is shorter than one of the law's, samples.
     pub(super) fn delay_odds(&self, delay: f64) -> [f64; 2] {
         let odds = |part: &dyn Fn(f64) -> bool| {
             let mut sums = [f64::MIN_POSITIVE; 2];
@@ -70,7 +67,7 @@ impl Finding {
         };
         [
             odds(&|off| off > 0.5 * STEP),
-            odds(&|off| off < -1.5 * STEP),
+            odds(&|off| off < -0.5 * STEP),
         ]
     }
 }
@@ -142,7 +139,7 @@ impl Belief {
     pub(super) fn new(least: f64) -> Self {
         let weight = |d: usize| match delay_at(d) {
             delay if delay < least - 1e-9 => 0.0,
-            delay => (-DELAY_PRIOR * delay.abs()).exp(),
+            _ => 1.0,
         };
         let all: f64 = (0..DELAYS).map(weight).sum();
         let prior = std::array::from_fn(|d| weight(d) / all);

@@ -40,6 +40,11 @@ impl Colour {
         }
     }
 
+    /// Mean square of the residual, um^2.
+    pub(super) fn usual_um2(&self) -> f64 {
+        self.correlations_um2[0]
+    }
+
     /// Removes the part that the past predicts from the series of a fix with this residual.
     pub(super) fn take_out(&mut self, series: &mut [f64; SERIES], left_um: f64) {
         let now = *series;

@@ -32,7 +32,7 @@ use evidence::Evidence;
 use lines::{LineSettings, Lines};
 use motion::Motion;
 pub use retuning::{AdaptMode, AdaptNews};
-use retuning::{DELAYS, NOMINAL, Retuning, TUNINGS};
+use retuning::{DELAYS, INTERVAL, NOMINAL, REPORTED_GAIN, Retuning, TUNINGS};
 use serde::Serialize;
 use whiten::{Covariance, Track, Whitener};
 
@@ -46,12 +46,10 @@ pub const ADAPT_COLUMNS: [&str; 6] = [
     "adapt_dither_um",
 ];
 
-/// Standard deviation of the logarithm of the gain above which the dither is louder, and its largest factor. In a quiet hold at 1 kHz the
-/// estimate reaches it. Under a strong disturbance and just after a change the dither costs up to four times as much for some seconds.
-const KNOWN: f64 = 0.04;
+/// Largest factor by which the dither is louder where the gain is not known: it costs four times as much then. A gain is known whose
+/// interval is no wider than the least change that is reported; in a quiet hold at 1 kHz it comes to that.
 const LOUDEST: f64 = 2.0;
-/// Part of the stated uncertainty of the gain that stays, whatever is found.
-const LEAST_DOUBT: f64 = 0.1;
+const KNOWN: f64 = 0.5 * REPORTED_GAIN / INTERVAL;
 
 /// Where adaptation stands.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -108,7 +106,7 @@ pub struct AdaptState {
     silent: u32,
     evidence: Evidence,
     colour: Colour,
-    noise: learn::Noise,
+    now: learn::Now,
     lines: Lines,
     /// The model on the path that cancels the lines, and its next command, um; `None` while the loop does not control the bead.
     inverse: Option<FeedForwardState>,
@@ -180,7 +178,7 @@ impl Adapter {
             silent: 0,
             evidence: Evidence::new(-self.delay_samples, self.whitener.noise_um2),
             colour: Colour::new(self.whitener.noise_um2),
-            noise: learn::Noise::new(self.whitener.noise_um2),
+            now: learn::Now::default(),
             lines: Lines::new(),
             inverse: None,
             cancel_um: 0.0,
@@ -222,7 +220,7 @@ impl Adapter {
             return 1.0;
         };
         let off = (found.log_gain - state.force.log_gain).abs();
-        ((off + 2.0 * found.log_sd) / stated.max(1e-3)).clamp(LEAST_DOUBT, 1.0)
+        ((off + 2.0 * found.log_sd) / stated.max(1e-3)).min(1.0)
     }
 
     /// What is to be added to the command of this tick, um.

@@ -3,7 +3,7 @@
 //! Towards caution (more gain than tuned for) at once, towards boldness slowly. While the tuning is within the interval of the estimate it
 //! settles there.
 
-use super::belief::Finding;
+use super::belief::{self, Finding};
 use serde::Serialize;
 
 /// Where the tuning stands.
@@ -25,27 +25,24 @@ pub enum AdaptMode {
 
 /// Delays that the law can be tuned to, beyond the design's, samples.
 pub(super) const DELAYS: [f64; TUNINGS] = [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5];
-/// How many.
-pub(super) const TUNINGS: usize = 6;
+/// How many: those of the belief but its last, which is more than the law can be tuned to.
+pub(super) const TUNINGS: usize = belief::DELAYS - 1;
 /// The design's own among them.
 pub(super) const NOMINAL: usize = 2;
-/// Gains, over the design's, that the law is tuned to.
-const GAINS: [f64; 2] = [0.4, 2.5];
+/// Largest gain over the design's that the law is tuned to, and largest design's over the gain.
+const RANGE: f64 = 2.5;
 /// Largest change per tick of the logarithm of the gain in force downwards: something that holds the bead is known by its stillness after
 /// some 200 ticks, and the gain in force has changed by 10 % then. Half the gain is in force 1.4 s after it is known at 1 kHz.
 const DOWN_PER_TICK: f64 = 0.0005;
 /// Standard deviations of a 95 % interval. A tuning outside of it follows the estimate at once.
-const INTERVAL: f64 = 1.96;
-/// Ticks in which a tuning inside of it settles at the estimate: longer than a belief in a change that the next blocks refute, less than
-/// the 28 s that the estimate remembers.
-const SETTLE_TICKS: f64 = 500.0;
+pub(super) const INTERVAL: f64 = 1.96;
 /// Logarithm of the odds by which a delay in force is too short, or too long: it is outside a 95 % interval.
 const DELAY_SURE: f64 = 3.66;
 /// Logarithm of the odds of a change that is reported: one of 3000 is false if the noise is as it is measured.
 const REPORT_SURE: f64 = 8.0;
 /// A change of the gain that is reported, by its logarithm. The tuning, and a standard deviation of the estimate, must first be within half
 /// of that change of the estimate, so that one step is reported once.
-const REPORTED_GAIN: f64 = 0.14;
+pub(super) const REPORTED_GAIN: f64 = 0.14;
 
 /// A change of the tuning that a run reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -120,7 +117,7 @@ impl Retuning {
     /// A tick in which the estimate may come into force.
     pub(super) fn follow(&mut self, found: Option<&Finding>, usable: &[bool; TUNINGS]) {
         // What is surely less than any plant's is no gain: something holds the bead.
-        let of_a_plant = |found: &&Finding| found.gain + found.gain_sd > GAINS[0];
+        let of_a_plant = |found: &&Finding| found.gain + found.gain_sd > 1.0 / RANGE;
         let Some(found) = found.filter(of_a_plant) else {
             self.wait();
             return;
@@ -128,7 +125,7 @@ impl Retuning {
         let sd = found.log_sd;
         let off = found.log_gain - self.log_gain;
         let outside = off.abs() > INTERVAL * sd;
-        self.go(if outside { off } else { off / SETTLE_TICKS });
+        self.go(if outside { off } else { off * DOWN_PER_TICK });
         // The range ends short of the estimate by more than its uncertainty.
         let beyond = off.abs() > sd && self.log_gain == self.log_gain_after(off);
         self.mode = match self.follow_delay(found, usable) {
@@ -145,9 +142,9 @@ impl Retuning {
         self.log_gain = self.log_gain_after(way);
     }
 
-    /// Where that leads, within [`GAINS`].
+    /// Where that leads, within [`RANGE`].
     fn log_gain_after(&self, way: f64) -> f64 {
-        (self.log_gain + way.max(-DOWN_PER_TICK)).clamp(GAINS[0].ln(), GAINS[1].ln())
+        (self.log_gain + way.max(-DOWN_PER_TICK)).clamp(-RANGE.ln(), RANGE.ln())
     }
 
     fn follow_delay(&mut self, found: &Finding, usable: &[bool; TUNINGS]) -> DelayStep {
@@ -186,7 +183,7 @@ impl Retuning {
         // Odds of a normal distribution, to its second order.
         let sure = (2.0 * REPORT_SURE).sqrt() * found.log_sd;
         let farther = 0.5 * REPORTED_GAIN + INTERVAL * before.log_sd + sure;
-        let gain = change > REPORTED_GAIN && change > farther;
+        let gain = change > farther;
         let surely_not = |member: usize, sure: f64| {
             let [longer, shorter] = found.delay_odds(DELAYS[member]);
             longer.max(shorter) > sure

@@ -4,9 +4,6 @@ use crate::error::BuildError;
 use crate::riccati::solve_dare;
 use nalgebra::{DMatrix, DVector};
 
-/// Times between two fixes that count, ticks.
-const APART: (f64, f64) = (0.25, 1000.0);
-
 /// Kalman filter of a random walk whose drift wanders as well, for fixes at any distance from each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Whitener {
@@ -112,7 +109,7 @@ impl Whitener {
         usual_um2: f64,
     ) -> Correction {
         let fix_um2 = fix_um2.max(self.least_um2);
-        let ticks = ticks.clamp(APART.0, APART.1);
+        let ticks = ticks.max(0.0);
         let prior = [
             pp + ticks * (2.0 * pd + ticks * dd) + self.walk_um2 * ticks,
             pd + ticks * dd,
