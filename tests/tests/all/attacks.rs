@@ -4,8 +4,13 @@ use cellpos_tests::attack::{self, Attacked, Chance};
 use cellpos_tests::programs::alone;
 use std::path::Path;
 
+/// An attack in real time.
 fn stands(attack: impl Fn(&Path, u64, &mut Chance) -> Attacked, tries: u64) {
     let _alone = alone();
+    stands_beside_others(attack, tries);
+}
+
+fn stands_beside_others(attack: impl Fn(&Path, u64, &mut Chance) -> Attacked, tries: u64) {
     let folder = tempfile::tempdir().unwrap();
     let attacked = attack(folder.path(), tries, &mut Chance::new(7));
     assert!(attacked.tries >= 1, "{attacked:?}");
@@ -19,7 +24,7 @@ fn a_killed_program_goes_on_and_does_every_cycle_once() {
 
 #[test]
 fn damaged_inputs_get_an_answer() {
-    stands(attack::inputs::damaged_inputs, 70);
+    stands_beside_others(attack::inputs::damaged_inputs, 70);
 }
 
 #[test]

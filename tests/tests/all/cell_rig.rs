@@ -1,5 +1,6 @@
 //! A cell on a rig with its own camera: the empty channel is recorded first, then the cell is followed against it.
 
+use crate::rig_in_a_box::median_error_nm;
 use cellpos_record::RunReader;
 use cellpos_tests::programs::{RigInABox, cellpos, stdout};
 use serde_json::Value;
@@ -97,12 +98,11 @@ fn a_cell_is_followed_over_a_socket_against_a_background_recorded_before() {
         String::from_utf8_lossy(&output.stderr)
     );
     let summary: Value = serde_json::from_str(&text).unwrap();
-    let rms_nm = summary["rms_measured_nm"]
-        .as_f64()
-        .unwrap_or_else(|| panic!("{text}"));
-    // How well it is held is a figure of the machine: 60 nm on an idle one, several um where nobody holds it.
-    assert!(rms_nm < 1000.0, "{text}");
-    let reader = RunReader::open(&at.join(summary["run"].as_str().unwrap())).unwrap();
+    let run = at.join(summary["run"].as_str().unwrap());
+    // On an idle machine 60 nm RMS, or 40 nm in the median.
+    let median_nm = median_error_nm(&run);
+    assert!(median_nm < 400.0, "{median_nm} nm: {text}");
+    let reader = RunReader::open(&run).unwrap();
     let meta = reader.meta().unwrap();
     assert!(
         meta.inputs

@@ -12,7 +12,8 @@ use std::time::Duration;
 const PARK_UM: f64 = 12.0;
 const SLEW_UM_PER_S: f64 = 1000.0;
 const WATCHDOG_MS: f64 = 20.0;
-const HOLD_WATCHDOG_MS: f64 = 150.0;
+/// Longer than this machine stalls.
+const HOLD_WATCHDOG_MS: f64 = 2000.0;
 
 /// rig.toml for the box, patient with stalls of the machine unless `watchdog_ms` is short.
 fn write_rig(folder: &Path, watchdog_ms: f64) {
@@ -34,6 +35,17 @@ fn run_folder(folder: &Path) -> Option<PathBuf> {
         .flatten()
         .map(|entry| entry.path())
         .next()
+}
+
+/// Half of all fixes are closer to the target than this, nm: what stalls of the machine leave as it is.
+pub(crate) fn median_error_nm(run: &Path) -> f64 {
+    let (ticks, _) = RunReader::open(run).unwrap().ticks().unwrap();
+    let mut errors_nm: Vec<f64> = (ticks.iter())
+        .map(|tick| 1e3 * (tick.measured_um - tick.target_um).abs())
+        .filter(|nm| nm.is_finite())
+        .collect();
+    errors_nm.sort_by(f64::total_cmp);
+    errors_nm[errors_nm.len() / 2]
 }
 
 fn seconds(rows: &[BoxRow], state: &str) -> f64 {
@@ -92,13 +104,13 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
     assert!(by_the_clock <= periods + 500, "{r}");
     // The tick that ends the run may itself be late.
     assert!((5000..6000).contains(&periods), "{r}");
-    let rms = r["rms_measured_nm"].as_f64().unwrap();
+    // On an idle machine 57 nm RMS, or 38 nm in the median, which the CPUs taken away for tens of milliseconds leave as it is.
+    let median_nm = median_error_nm(&run_folder(folder.path()).unwrap());
     println!(
-        "{rms:.1} nm RMS against a bound of {} nm",
-        r["bound_rms_nm"]
+        "{} nm RMS against a bound of {} nm; median {median_nm:.1} nm",
+        r["rms_measured_nm"], r["bound_rms_nm"]
     );
-    // On an idle machine 57 nm; with the CPUs taken away for tens of milliseconds at times it is more.
-    assert!(rms < 1000.0, "{r}");
+    assert!(median_nm < 150.0, "{median_nm} nm: {r}");
     assert!(r["frames_lost"].as_f64().unwrap() > 0.0, "{r}");
     let last = rows.last().unwrap();
     assert!((last.applied_um - PARK_UM).abs() < 0.01, "{last:?}");
@@ -111,10 +123,8 @@ fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), WATCHDOG_MS);
     let rig = folder.path().join("rig.toml");
-    let text = std::fs::read_to_string(&rig).unwrap();
     // The stalls of this machine come on top.
-    let text = text.replace("hold_watchdog_ms = 150", "hold_watchdog_ms = 2000")
-        + "board_silence_ms = 1000.0\n";
+    let text = std::fs::read_to_string(&rig).unwrap() + "board_silence_ms = 1000.0\n";
     std::fs::write(rig, text).unwrap();
     let faults = [
         "--line-stall",
@@ -151,13 +161,6 @@ fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted
 
 #[test]
 fn the_board_parks_by_itself_when_the_program_is_killed_and_the_record_reads_back() {
-    // A stall of the machine longer than the watchdog's time ends the run before the kill: then once more.
-    let killed = (0..5).any(|_| kill_and_look());
-    assert!(killed, "five times the run ended before it could be killed");
-}
-
-/// Kills a run and checks its remains; false if the run had ended before.
-fn kill_and_look() -> bool {
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), WATCHDOG_MS);
     let rig = RigInABox::start(folder.path(), &[]);
@@ -172,13 +175,11 @@ fn kill_and_look() -> bool {
             .is_some_and(|ticks| ticks.len() > 300_000)
             || child.try_wait().unwrap().is_some()
     });
-    if child.try_wait().unwrap().is_some() {
-        return false;
-    }
+    assert_eq!(child.try_wait().unwrap(), None, "the run ended by itself");
     child.kill().unwrap();
     let killed_ns = cellpos_rig::clock::monotonic_ns();
     child.wait().unwrap();
-    std::thread::sleep(Duration::from_millis(400));
+    std::thread::sleep(Duration::from_millis(HOLD_WATCHDOG_MS as u64 + 400));
     let rows = rig.finish();
 
     // First the zero-flow displacement is held, and the bead almost stops. Within both watchdog times plus the ramp the PZT is at
@@ -237,7 +238,6 @@ fn kill_and_look() -> bool {
             .iter()
             .any(|event| event.event == "running")
     );
-    true
 }
 
 #[test]

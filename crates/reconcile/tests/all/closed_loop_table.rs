@@ -52,9 +52,14 @@ fn rest_um(record: &Record) -> f64 {
 
 /// What is said of a loop that hides an effect, whose rest is not known before.
 fn look(hidden: Hidden, seed: u64) -> Reconciliation {
+    look_for(hidden, seed, Options::default().max_effects)
+}
+
+fn look_for(hidden: Hidden, seed: u64, max_effects: usize) -> Reconciliation {
     let record = closed_loop(flow_of(seed), hidden, survey, seed);
     let options = Options {
         free_working_point: true,
+        max_effects,
         ..Options::default()
     };
     let rest_um = rest_um(&record);
@@ -71,6 +76,13 @@ fn a_leak_is_named_although_the_command_runs_away_with_the_drift_of_the_zero_flo
 #[test]
 fn a_bead_that_sticks_does_so_in_the_flow_and_nothing_is_named_beside_it() {
     // The command follows the zero flow. A wall that acts on the command alone leaves a leak or a flow to be named.
+    let adhesion = Hidden::Adhesion(40.0);
+    assert!(row(adhesion, &look_for(adhesion, 102, 2)));
+}
+
+#[test]
+#[ignore = "slow: as many effects as a command looks for; the fast one looks for two"]
+fn a_bead_that_sticks_does_so_in_the_flow_among_all_that_a_command_looks_for() {
     let adhesion = Hidden::Adhesion(40.0);
     assert!(row(adhesion, &look(adhesion, 102)));
 }

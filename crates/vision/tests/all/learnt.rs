@@ -226,10 +226,11 @@ fn judge(name: &str, snr: f64, score: &Score, bound_px: f64, failed: &mut Vec<St
     }
 }
 
-#[test]
-fn suggested_profiles_of_small_and_faint_beads_tell_the_truth() {
-    let mut failed = Vec::new();
-    for (name, profile) in [
+const RATIOS: [f64; 4] = [5.0, 10.0, 40.0, 200.0];
+
+/// The rows of a table that `take` takes, by the numbers of profile and ratio.
+fn suggested_profiles(take: impl Fn(usize, usize) -> bool) {
+    let profiles = [
         gaussian(1.0),
         gaussian(1.5),
         gaussian(2.5),
@@ -237,8 +238,13 @@ fn suggested_profiles_of_small_and_faint_beads_tell_the_truth() {
         ring(6.4),
         disc(4.0),
         disc(9.0),
-    ] {
-        for snr in [5.0, 10.0, 40.0, 200.0] {
+    ];
+    let mut failed = Vec::new();
+    for (of, (name, profile)) in profiles.iter().enumerate() {
+        for (at, &snr) in RATIOS.iter().enumerate() {
+            if !take(of, at) {
+                continue;
+            }
             let mut random = Random(17);
             let fields: Vec<Field> = (0..LEARNT_FROM)
                 .map(|_| Field::new(profile.as_ref(), snr, &mut random))
@@ -254,23 +260,31 @@ fn suggested_profiles_of_small_and_faint_beads_tell_the_truth() {
             };
             let mut localiser = Localiser::new(found.config).unwrap();
             let score = measured(&mut localiser, profile.as_ref(), snr, &mut random, 1500);
-            judge(
-                &name,
-                snr,
-                &score,
-                bound(profile.as_ref(), snr),
-                &mut failed,
-            );
+            let bound_px = bound(profile.as_ref(), snr);
+            judge(name, snr, &score, bound_px, &mut failed);
         }
     }
     assert!(failed.is_empty(), "{failed:?}");
 }
 
 #[test]
-fn profiles_learnt_in_the_loop_from_small_and_faint_beads_tell_the_truth() {
+fn suggested_profiles_of_small_and_faint_beads_tell_the_truth() {
+    suggested_profiles(|profile, ratio| ratio == profile % RATIOS.len());
+}
+
+#[test]
+#[ignore = "slow: every profile at every ratio; the fast one has each profile once and each ratio"]
+fn suggested_profiles_tell_the_truth_at_every_ratio() {
+    suggested_profiles(|_, _| true);
+}
+
+fn profiles_learnt_in_the_loop(take: impl Fn(usize, usize) -> bool) {
     let mut failed = Vec::new();
-    for sigma_px in [1.5, 3.0] {
-        for snr in [5.0, 10.0, 40.0, 200.0] {
+    for (of, sigma_px) in [1.5, 3.0].into_iter().enumerate() {
+        for (at, &snr) in RATIOS.iter().enumerate() {
+            if !take(of, at) {
+                continue;
+            }
             let (name, profile) = gaussian(sigma_px);
             let mut random = Random(23);
             // Given a tenth too large.
@@ -287,14 +301,20 @@ fn profiles_learnt_in_the_loop_from_small_and_faint_beads_tell_the_truth() {
             let mut localiser = Localiser::new(config).unwrap();
             measured(&mut localiser, profile.as_ref(), snr, &mut random, 40);
             let score = measured(&mut localiser, profile.as_ref(), snr, &mut random, 1500);
-            judge(
-                &name,
-                snr,
-                &score,
-                bound(profile.as_ref(), snr),
-                &mut failed,
-            );
+            let bound_px = bound(profile.as_ref(), snr);
+            judge(&name, snr, &score, bound_px, &mut failed);
         }
     }
     assert!(failed.is_empty(), "{failed:?}");
+}
+
+#[test]
+fn profiles_learnt_in_the_loop_from_small_and_faint_beads_tell_the_truth() {
+    profiles_learnt_in_the_loop(|profile, ratio| ratio % 2 == profile);
+}
+
+#[test]
+#[ignore = "slow: both profiles at every ratio; the fast one has each ratio once"]
+fn profiles_learnt_in_the_loop_tell_the_truth_at_every_ratio() {
+    profiles_learnt_in_the_loop(|_, _| true);
 }

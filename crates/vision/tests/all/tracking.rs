@@ -81,18 +81,6 @@ struct Encounters {
     worst_px: f64,
 }
 
-impl Encounters {
-    fn with(self, more: Self) -> Self {
-        Self {
-            kept: self.kept + more.kept,
-            given_up: self.given_up + more.given_up,
-            switched: self.switched + more.switched,
-            coasted_frames: self.coasted_frames + more.coasted_frames,
-            worst_px: self.worst_px.max(more.worst_px),
-        }
-    }
-}
-
 /// One encounter: the neighbour passes at `impact_px` with the relative speed `speed`, under a common flow.
 fn encounter(scene: &mut Scene, seed: u64, outcome: &mut Encounters) {
     let mut random = Random(seed);
@@ -143,28 +131,26 @@ fn encounter(scene: &mut Scene, seed: u64, outcome: &mut Encounters) {
     }
 }
 
-#[test]
-fn two_hundred_encounters_pass_without_a_silent_switch() {
-    let halves = std::thread::scope(|scope| {
-        [1..=100, 101..=200]
-            .map(|seeds| {
-                scope.spawn(move || {
-                    let (mut outcome, mut scene) = (Encounters::default(), Scene::new());
-                    for seed in seeds {
-                        encounter(&mut scene, seed * 7919, &mut outcome);
-                    }
-                    outcome
-                })
-            })
-            .map(|half| half.join().expect("no encounter panics"))
-    });
-    let outcome = halves
-        .into_iter()
-        .fold(Encounters::default(), Encounters::with);
-    println!("200 encounters of two like beads: {outcome:?}");
+fn encounters(count: u64) {
+    let (mut outcome, mut scene) = (Encounters::default(), Scene::new());
+    for seed in 1..=count {
+        encounter(&mut scene, seed * 7919, &mut outcome);
+    }
+    println!("{count} encounters of two like beads: {outcome:?}");
     assert_eq!(outcome.switched, 0, "{outcome:?}");
     // Giving up is honest, but a tracker that always gives up is of no use.
-    assert!(outcome.kept >= 150, "{outcome:?}");
+    assert!(4 * outcome.kept as u64 >= 3 * count, "{outcome:?}");
+}
+
+#[test]
+fn fifty_encounters_pass_without_a_silent_switch() {
+    encounters(50);
+}
+
+#[test]
+#[ignore = "slow: the fast one has 50"]
+fn two_hundred_encounters_pass_without_a_silent_switch() {
+    encounters(200);
 }
 
 #[test]
