@@ -11,8 +11,6 @@ mod edge;
 mod measure;
 mod normals;
 
-use normals::Profile;
-
 /// Most rays.
 pub(crate) const MAX_RAYS: usize = 128;
 /// Fewest rays.
@@ -176,9 +174,8 @@ pub(crate) struct Outliner {
     sorted: Vec<(f64, f64)>,
     shapes: edge::Shapes,
     smear: normals::Smear,
-    /// Blur of the frame, px, and what it leaves unknown of the edge, px.
+    /// Blur of the frame, px.
     blur_px: f64,
-    blur_left_px: f64,
 }
 
 impl Outliner {
@@ -200,7 +197,6 @@ impl Outliner {
             shapes: edge::Shapes::new(),
             smear: normals::Smear::new(),
             blur_px: 0.0,
-            blur_left_px: 0.0,
         }
     }
 
@@ -251,27 +247,11 @@ impl Outliner {
         let profile = self.align(half, polarity)?;
         self.shift_points();
         let edge = profile.edge(self.radius_px(), &self.shapes, trust)?;
-        self.blur_left_px = self.left_by_blur_px(&profile, edge.at_px, trust);
         self.find_normals();
         self.shift_outwards(edge.at_px);
         let residual = self.residual().max(noise * noise);
         self.shift_by_smear();
         let edge_px = profile.edge_width_px();
         self.measure(contrast, residual, (edge.rim_grey, edge.halo_grey), edge_px)
-    }
-
-    /// Standard deviation of what the blur has moved the edge by, px. It shows when the profile is blurred by as much once more. To
-    /// first order in the blur's square, a round edge recedes by half of that over the radius, and one that is not symmetric goes by up to
-    /// half of it over the edge's width: less is not believed.
-    fn left_by_blur_px(&self, profile: &Profile, at_px: f64, trust: f64) -> f64 {
-        if self.blur_px <= 0.0 {
-            return 0.0;
-        }
-        let radius_px = self.radius_px();
-        let softer = profile.softened(self.blur_px);
-        let again = softer.edge(radius_px, &self.shapes, trust);
-        let moves_px = again.map_or(self.blur_px, |edge| (edge.at_px - at_px).abs());
-        let half = 0.5 * self.blur_px * self.blur_px;
-        moves_px.max(half / radius_px.min(profile.edge_width_px()))
     }
 }

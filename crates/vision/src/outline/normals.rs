@@ -329,12 +329,6 @@ impl Profile {
         )
     }
 
-    /// The profile blurred by a Gaussian of this standard deviation, px: three boxes make one.
-    pub(super) fn softened(&self, px: f64) -> Self {
-        let box_px = 2.0 * px;
-        self.smeared(box_px).smeared(box_px).smeared(box_px)
-    }
-
     /// Width of the edge, from the rim to the halo, at least a pixel.
     pub(super) fn edge_width_px(&self) -> f64 {
         (self.halo().saturating_sub(self.rim()) as f64 * FINE_PX).max(1.0)
