@@ -15,7 +15,6 @@ class Device:
         self.line = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(self.line, termios.TCSANOW)
         self.seq = 0
-        self.log = open("sets.txt", "a")
         self.send("Hello", protocol=2)
         # The device itself waits ten seconds: whoever serves it is the one to be judged.
         self.send(
@@ -26,8 +25,8 @@ class Device:
         os.write(self.line, encode(TO_BOARD, (name, fields)))
 
     def set(self, um: float) -> None:
-        # What was set, and when, for whoever judges it.
-        print(time.monotonic(), um, file=self.log, flush=True)
+        # What was set, and when, for whoever judges it: over a pipe, for a disk that others use lets a writer wait for 0.3 s.
+        print(time.monotonic(), um, file=sys.stderr, flush=True)
         try:
             os.read(self.line, 65536)
         except BlockingIOError:

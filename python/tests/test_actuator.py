@@ -4,8 +4,10 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -102,6 +104,19 @@ def test_silence_is_answered_in_two_stages_and_a_late_command_takes_up_again():
     assert made.state == "Safe" and made.ignored == 1
 
 
+def test_a_command_is_answered_with_the_output_that_obeys_it():
+    made = board()
+    arm(made)
+    made.out.clear()
+    for seq in range(5):
+        command(made, seq, 5.2 + 0.1 * seq, 1000 + seq * 20_000)
+        assert not [fields for name, fields in made.out if name == "Status" and fields["last_seq"] == seq]
+        applied = made.step(1000 + seq * 20_000)
+        name, fields = made.out[-1]
+        assert (name, fields["last_seq"], fields["applied_pm"]) == ("Status", seq, applied)
+    assert applied == 5_600_000
+
+
 def test_old_doubled_and_foreign_commands_are_ignored_and_a_running_session_is_not_taken():
     made = board()
     arm(made)
@@ -148,6 +163,7 @@ def test_values_that_cannot_be_are_named(tmp_path):
 
 # -- served, with the emulated bead behind it
 
+# From the call of the function to the emulated bead a pseudo-terminal and the next millisecond of the board behind it take 0.9 ms.
 LAG = """name = "pressure"
 working_point_um = 20.0
 [plant]
@@ -156,6 +172,9 @@ den = [1.0, 76.3, 0.13]
 [noise]
 diffusion_um2_per_s = 0.33
 localisation_um = 0.03
+[camera]
+delay_ms = 3.2
+frame_age_ms = 2.3
 [[effects]]
 id = "driver-lag"
 bandwidth_hz = 3.18
@@ -172,14 +191,19 @@ class Lab:
         (folder / "box.toml").write_text(text)
         text = re.sub(r"(?ms)^\[actuator\].*?\n\n", f'[actuator]\nkind = "program"\nsocket = "actuator.sock"\nperiod_ms = {PERIOD_MS}\n\n', text)
         text = re.sub(r"(?m)^period_us.*\n", "", text).replace("oldest_ms = 5.0", "oldest_ms = 60.0")
+        # A machine that others use is late for longer than a rig may be.
+        text = text.replace("faults_in_a_row = 5", "faults_in_a_row = 100000").replace("board_silence_ms = 212.0", "board_silence_ms = 2000.0")
         (folder / "rig.toml").write_text(text)
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        words = [firmware_sim(), "--rig", "box.toml", "--pty-link", "pzt", "--socket", "camera.sock", "--duration", "90s"]
+        words = [firmware_sim(), "--rig", "box.toml", "--pty-link", "pzt", "--socket", "camera.sock", "--duration", "300s"]
         self.box = subprocess.Popen(words, cwd=folder, **quiet)
         self.wait_for("camera.sock")
         env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))
         words = [sys.executable, ROOT / "python/tests/emulated_device.py", "pzt", "actuator.sock", str(PERIOD_MS * 1e-3)]
-        self.server = subprocess.Popen(words, cwd=folder, env=env, stdout=subprocess.PIPE, text=True)
+        self.server = subprocess.Popen(words, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.said = []
+        self.listener = threading.Thread(target=self.listen, daemon=True)
+        self.listener.start()
         self.wait_for("actuator.sock")
 
     def wait_for(self, name: str) -> None:
@@ -189,22 +213,24 @@ class Lab:
             time.sleep(0.02)
         raise AssertionError(f"no {name}")
 
+    def listen(self) -> None:
+        for line in self.server.stderr:
+            self.said.append([float(word) for word in line.split()])
+
     def sets(self):
-        return np.loadtxt(self.folder / "sets.txt", ndmin=2)
+        return np.array(self.said)
 
     def driven(self, live) -> None:
         """Waits until the bead is held: commands come."""
-        next(live.batches())
-        for _ in range(500):
+        while live.running:
             if len(self.sets()) > 40:
                 return
             time.sleep(0.02)
-        raise AssertionError("no commands")
+        raise AssertionError(f"no commands: {live.result.values_['ended']}")
 
-    def track(self, duration="8s"):
-        return cellpos.track(
-            "0um", duration, rig="rig.toml", model="model.toml", controller="lqg", best_effort=True, cwd=self.folder
-        )
+    def track(self, duration, **more):
+        options = {"rig": "rig.toml", "model": "model.toml", "controller": "lqg", "cwd": self.folder}
+        return cellpos.track("0um", duration, **options | more)
 
     def close(self) -> None:
         for child in (self.server, self.box):
@@ -226,27 +252,57 @@ def judged(sets) -> None:
     times, values = sets[:, 0], sets[:, 1]
     assert values.min() >= 0 and values.max() <= 40
     assert np.all(np.abs(np.diff(values)) <= 20000 * PERIOD_MS * 1e-3 + 1e-6)
-    assert np.diff(times).min() >= 0.85e-3 * PERIOD_MS
+    # Of three calls in a row the one in the middle may have been held up on its way to this clock.
+    assert (times[2:] - times[:-2]).min() >= 2 * 0.85e-3 * PERIOD_MS
+
+
+#: Ticks after which nothing is left of what a late one did to the bead: half a second, ten times the regulator's lag.
+SETTLES = 25
+
+
+def machine_kept_its_times(ticks):
+    """Ticks before which, for as long as the loop remembers, the machine did what the loop counts on: a tick each period, on a
+    picture as old as the rig file says, within a tenth of a period, and each command obeyed before the next."""
+    time_s, commands, applied = (ticks[name] for name in ("time_s", "pzt_um", "applied_um"))
+    tenth_s = 0.1e-3 * PERIOD_MS
+    good = (ticks["life"] == "running") & (ticks["request"] == "none") & (time_s - ticks["mid_exposure_s"] < 2e-3 + tenth_s)
+    good[1:] &= np.abs(np.diff(time_s) - 1e-3 * PERIOD_MS) < tenth_s
+    good[:-1] &= np.abs(applied[1:] - commands[:-1]) < 1e-3
+    good[-1:] = False
+    broken = np.flatnonzero(~good)
+    last = np.full(len(good), -1)
+    last[broken] = broken
+    return np.arange(len(good)) - np.maximum.accumulate(last) > SETTLES
 
 
 def test_a_bead_is_held_by_a_function_called_every_20_ms(lab_of_pressure):
-    for _ in range(3):
-        result = lab_of_pressure.track("12s").wait()
-        if result.ended == "done":
+    # Of 2000 ticks an RMS has a standard deviation of 2 %: half of its terms are independent. A busy machine takes longer.
+    enough, asked = 2000, 10000
+    live = lab_of_pressure.track(f"{asked * PERIOD_MS // 1000}s", adapt="off")
+    seen = 0
+    for batch in live.batches():
+        seen += len(batch["time_s"])
+        if seen > enough and np.count_nonzero(machine_kept_its_times(cellpos.open(live.folder).ticks)) > enough:
+            live.stop()
             break
-    print(f"held over Python at 50 Hz: {result['rms_measured_nm']:.0f} nm RMS, least {result['bound_rms_nm']:.0f}")
-    assert result.ended == "done", result.values_["ended"]
-    # How well it was held is a figure of the machine: LQG on the virtual clock 211 nm, a bead that nobody holds 3000 nm.
-    assert result["rms_measured_nm"] < 1000
+    result = live.result
+    run = result.run
+    error_um = run.error_um[machine_kept_its_times(run.ticks) & run.settled()]
+    nm = 1e3 * np.sqrt(np.nanmean(error_um**2))
+    bound = result["bound_rms_nm"]
+    print(f"held over Python at 50 Hz: {nm:.0f} nm RMS in {len(error_um)} of {result['ticks']} ticks, least {bound:.0f}: {nm / bound:.3f}")
+    assert len(error_um) > enough / 4 and np.isnan(error_um).mean() < 0.01
+    assert nm < 1.15 * bound
     judged(lab_of_pressure.sets())
     lab_of_pressure.server.send_signal(signal.SIGINT)
-    said, _ = lab_of_pressure.server.communicate(timeout=10)
-    assert "1 sessions" in said or "sessions" in said
+    assert lab_of_pressure.server.wait(timeout=10) == 0
+    assert "1 sessions" in lab_of_pressure.server.stdout.read()
+    lab_of_pressure.listener.join()
     assert lab_of_pressure.sets()[-1, 1] == 20.0
 
 
 def test_a_program_that_is_killed_ends_in_hold_and_then_park(lab_of_pressure):
-    live = lab_of_pressure.track("30s")
+    live = lab_of_pressure.track("100s")
     lab_of_pressure.driven(live)
     time.sleep(1.0)
     os.kill(live.pid, signal.SIGKILL)
@@ -262,7 +318,7 @@ def test_a_program_that_is_killed_ends_in_hold_and_then_park(lab_of_pressure):
 
 
 def test_an_actuator_that_dies_ends_the_run_and_is_named(lab_of_pressure):
-    live = lab_of_pressure.track("30s")
+    live = lab_of_pressure.track("100s")
     lab_of_pressure.driven(live)
     lab_of_pressure.server.kill()
     result = live.wait(timeout=10)
@@ -271,7 +327,7 @@ def test_an_actuator_that_dies_ends_the_run_and_is_named(lab_of_pressure):
 
 
 def test_an_actuator_that_stalls_ends_the_run_in_safe_and_parks_when_it_wakes(lab_of_pressure):
-    live = lab_of_pressure.track("30s")
+    live = lab_of_pressure.track("100s")
     lab_of_pressure.driven(live)
     lab_of_pressure.server.send_signal(signal.SIGSTOP)
     result = live.wait(timeout=10)
@@ -297,6 +353,31 @@ def test_a_period_that_contradicts_the_loops_is_refused(tmp_path):
     (tmp_path / "rig.toml").write_text('[actuator]\nkind = "program"\nsocket = "a"\nperiod_ms = 20\n[timing]\nperiod_us = 5000.0\n')
     with pytest.raises(cellpos.Failed, match="period_us = 5000: the actuator takes a command each 20000 us"):
         cellpos.track("0um", rig="rig.toml", cwd=tmp_path).wait()
+
+
+def test_a_command_that_comes_late_makes_no_later_one_wait(tmp_path):
+    called, sent = {}, {}
+
+    def note(um):
+        called[round(um, 3)] = time.monotonic()
+
+    server = cellpos.ActuatorServer(note, 0.0, 40.0, 1000.0, 0.02, tmp_path / "a.sock", park=20.0)
+    with server, socket.socket(socket.AF_UNIX) as host:
+        host.connect(str(tmp_path / "a.sock"))
+        limits = dict.fromkeys(("watchdog_ms", "hold_watchdog_ms", "park_pm", "limits"))
+        arming = ("Arm", {"session": 7, "interpolate": False, "status_every": 0, **limits})
+        host.sendall(_wire.encode(_wire.TO_BOARD, ("Hello", {"protocol": 2})) + _wire.encode(_wire.TO_BOARD, arming))
+        begun = time.monotonic()
+        for seq in range(100):
+            # One is 8 ms late.
+            time.sleep(max(0.0, begun + 0.02 * (seq + 1) + 0.008 * (seq == 30) - time.monotonic()))
+            um = round(20.0 + 0.01 * (seq + 1), 3)
+            fields = {"session": 7, "seq": seq, "time_us": 0, "displacement_pm": round(um * 1e6), "neutral_pm": 20_000_000}
+            sent[um] = time.monotonic()
+            host.sendall(_wire.encode(_wire.TO_BOARD, ("Command", fields)))
+    waited = [called[um] - at for um, at in list(sent.items())[40:] if um in called]
+    print(f"waited {1e3 * np.median(waited):.2f} ms (median of {len(waited)})")
+    assert len(waited) > 30 and np.median(waited) < 0.004
 
 
 def test_a_function_that_fails_is_raised_and_the_run_ends_in_safe(tmp_path):

@@ -7,7 +7,7 @@ pub use crate::fit::{prepare, stated_exposure_s};
 use crate::provenance;
 use crate::rig::{Finished, Rig};
 use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, RigFile};
-use crate::setup::{ReferenceSpec, Setup};
+use crate::setup::{ReferenceSpec, Setup, command_delay_s};
 use cellpos_control::ControllerKind;
 use cellpos_control::LoopModel;
 use cellpos_control::design::{DesignPlant, bound_rms_of_path_um, bound_rms_um};
@@ -286,9 +286,11 @@ pub fn possible_text(bound_rms_nm: Option<f64>, rms_nm: Option<f64>) -> String {
     }
 }
 
-/// The bound of a set-up's path with another camera path, um.
-pub fn bound_of_um(setup: &Setup, diffusion: f64, noise_um: f64, delay_s: f64) -> f64 {
+/// The bound of a set-up's path with another camera path of `frame_age_s`, um. A command's way to the bead, measured with the model, is
+/// part of the path.
+pub fn bound_of_um(setup: &Setup, diffusion: f64, noise_um: f64, frame_age_s: f64) -> f64 {
     let sample_s = setup.config.timing.period_us * 1e-6;
+    let delay_s = frame_age_s + command_delay_s(&setup.model);
     let plant =
         DesignPlant::from_model(&setup.model, Some(delay_s + 0.5 * sample_s), sample_s).ok();
     let model = plant.and_then(|plant| plant.loop_model().ok());
@@ -349,4 +351,31 @@ fn gain_warning(ratio: f64, calibration: Option<&Calibration>) -> String {
          {pixel}, and so do a wrong um per volt and the model of another chip: calibrate with a stage micrometre (cellpos \
          calibrate); if pixel and drive are right measure this rig (cellpos identify)"
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rig_file::Frames;
+    use crate::{Options, Rig};
+
+    #[test]
+    fn the_lowest_error_counts_the_way_of_a_command_to_the_bead() {
+        let options = Options {
+            clock: ClockKind::Virtual,
+            frames: Frames::Off,
+            best_effort: true,
+        };
+        let mut rig = Rig::open(RigFile::default(), options).ok().expect("a rig");
+        let prepared = rig.prepare("eq6", "pi").ok().expect("a law");
+        let hold = ReferenceSpec::Hold { position_um: 0.0 };
+        let mut setup = rig.set_up(prepared, hold).ok().expect("a set-up");
+        let bound_um = |setup: &Setup, frame_age_s| bound_of_um(setup, 0.33, 1e-3, frame_age_s);
+        let (short_um, long_um) = (bound_um(&setup, 2e-3), bound_um(&setup, 3e-3));
+        // A camera path of 2 ms, and 1 ms from a command to the bead.
+        (setup.model.camera_delay_s, setup.model.frame_age_s) = (Some(3e-3), Some(2e-3));
+        let found_um = bound_um(&setup, 2e-3);
+        assert!(short_um < 0.95 * long_um);
+        assert!((found_um - long_um).abs() < 1e-9, "{found_um} {long_um}");
+    }
 }

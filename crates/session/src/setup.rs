@@ -357,7 +357,7 @@ pub fn loop_delay_s(model: &Model, timing: &Timing) -> f64 {
 }
 
 /// Delay from a command to its effect on the bead, s: line, board and amplifier. 0 if the model does not state it.
-fn command_delay_s(model: &Model) -> f64 {
+pub(crate) fn command_delay_s(model: &Model) -> f64 {
     let beyond_s = |delay_s: f64| Some(delay_s - model.frame_age_s?);
     model
         .camera_delay_s

@@ -20,8 +20,8 @@ _LATE_US = 2_000
 _LONGEST_WATCHDOG_MS = 10_000
 _PM = 1e6
 _KEPT = 100_000
-#: A command is passed on at once if the last call was at least this share of a period ago: a host of the same period jitters by
-#: less.
+#: Least share of a period between two calls. A host of the same period jitters by less than the rest, and a command that had to wait, as
+#: after a late one, lets the next ones wait less: with a whole period between two calls all later commands would wait as long.
 _NEARLY = 0.9
 
 
@@ -94,7 +94,7 @@ class Board:
         self.watchdog_ms = min(max(20, round(5e3 * period)), _LONGEST_WATCHDOG_MS)
         self.hold_watchdog_ms = 2000
         self.state, self.fault = "Disarmed", "None"
-        self.greeted = self.led = self.commanded = False
+        self.greeted = self.led = self.commanded = self.owed = False
         self.ignored = self.late = self.clipped = self.bad_frames = self.sessions = 0
         self.applied = self.target = self.own_park
         self.held_since_us = self.next_status_us = self.stepped_us = self.now_us = 0
@@ -114,7 +114,7 @@ class Board:
         within = self.session.within(self.target) if self.state in ("Running", "Frozen", "Holding") else self.target
         reach = slew * elapsed_us // 1000
         self.applied += max(-reach, min(reach, within - self.applied))
-        if self.greeted and now_us >= self.next_status_us:
+        if self.owed or (self.greeted and now_us >= self.next_status_us):
             self.send_status()
         return self.applied
 
@@ -168,7 +168,7 @@ class Board:
 
     def send_status(self) -> None:
         self.next_status_us = self.now_us + _STATUS_EVERY_US
-        self.session.since_status = 0
+        self.session.since_status, self.owed = 0, False
         self.out.append(("Status", self.status()))
 
     # -- what is done
@@ -273,8 +273,8 @@ class Board:
         session.neutral = session.within(command["neutral_pm"])
         self.fault, self.state, self.commanded = "None", "Running", True
         session.since_status += 1
-        if 0 < session.status_every <= session.since_status:
-            self.send_status()
+        # It is told of when it has been obeyed: a host that hears nothing more takes the last output that it heard of for the one in force.
+        self.owed = self.owed or 0 < session.status_every <= session.since_status
 
 
 class ActuatorServer:
@@ -355,15 +355,15 @@ class ActuatorServer:
             self._skipped += behind
             due_s += behind * self._period_s
         while True:
-            left_s = due_s - time.monotonic()
+            now_s = time.monotonic()
+            if self.board.commanded:
+                due_s = min(due_s, max(now_s, self._called_s + _NEARLY * self._period_s))
+            left_s = due_s - now_s
             if left_s <= 0:
                 break
             wanted = [self._listener] + ([self._client] if self._client is not None else [])
             ready, _, _ = select.select(wanted, [], [], left_s)
             self._listen(ready)
-            if self.board.commanded and time.monotonic() - self._called_s >= _NEARLY * self._period_s:
-                due_s = time.monotonic()
-                break
         late_us = (time.monotonic() - due_s) * 1e6
         self._listen(select.select([self._client], [], [], 0)[0] if self._client is not None else [])
         self._call(self.board.step(self._now_us()), late_us)
