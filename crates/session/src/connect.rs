@@ -366,10 +366,10 @@ mod tests {
             frames: Frames::Off,
             best_effort: true,
         };
-        let mut rig = Rig::open(RigFile::default(), options).ok().expect("a rig");
-        let prepared = rig.prepare("eq6", "pi").ok().expect("a law");
+        let mut rig = Rig::open(RigFile::default(), options).expect("a rig");
+        let prepared = rig.prepare("eq6", "pi").expect("a law");
         let hold = ReferenceSpec::Hold { position_um: 0.0 };
-        let mut setup = rig.set_up(prepared, hold).ok().expect("a set-up");
+        let mut setup = rig.set_up(prepared, hold).expect("a set-up");
         let bound_um = |setup: &Setup, frame_age_s| bound_of_um(setup, 0.33, 1e-3, frame_age_s);
         let (short_um, long_um) = (bound_um(&setup, 2e-3), bound_um(&setup, 3e-3));
         // A camera path of 2 ms, and 1 ms from a command to the bead.
