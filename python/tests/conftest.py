@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,6 +23,12 @@ amplitude = "1um"
 frequency = "20Hz"
 cycles = 1200
 """
+
+
+def kept_for(good: np.ndarray, ticks: int) -> np.ndarray:
+    """Ticks that end a stretch of more than so many good ones."""
+    last = np.where(good, -1, np.arange(len(good)))
+    return np.arange(len(good)) - np.maximum.accumulate(last) > ticks
 
 
 def started(folder: Path, *words: str) -> None:

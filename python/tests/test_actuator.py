@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, kept_for
 from test_camera import firmware_sim
 
 import cellpos
@@ -269,10 +269,7 @@ def machine_kept_its_times(ticks):
     good[1:] &= np.abs(np.diff(time_s) - 1e-3 * PERIOD_MS) < tenth_s
     good[:-1] &= np.abs(applied[1:] - commands[:-1]) < 1e-3
     good[-1:] = False
-    broken = np.flatnonzero(~good)
-    last = np.full(len(good), -1)
-    last[broken] = broken
-    return np.arange(len(good)) - np.maximum.accumulate(last) > SETTLES
+    return kept_for(good, SETTLES)
 
 
 def test_a_bead_is_held_by_a_function_called_every_20_ms(lab_of_pressure):

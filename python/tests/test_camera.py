@@ -5,14 +5,16 @@ import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, kept_for
 
 import cellpos
+from cellpos import _camera
 from cellpos._camera import pack_header
 
 
@@ -44,7 +46,7 @@ def test_frames_arrive_as_they_were_with_stamp_and_number(tmp_path):
         pixels, stamp_ns = by_id[frame.frame_id]
         assert frame.mid_exposure_ns == stamp_ns and frame.pixels.dtype == pixels.dtype
         np.testing.assert_array_equal(frame.pixels, pixels)
-    assert server.stats.sent == len(got) and server.stats.unseen == 300 - len(got)
+    assert server.stats.sent == len(got) and server.stats.unseen + server.stats.dropped == 300 - len(got)
 
 
 def test_a_slow_reader_loses_whole_frames_that_are_counted_and_the_source_goes_on(tmp_path):
@@ -93,6 +95,33 @@ def test_a_socket_that_is_served_is_not_taken_and_one_left_behind_is(tmp_path):
     assert not path.exists()
 
 
+def test_who_finds_a_servers_socket_may_connect(tmp_path):
+    path, refused, stop = tmp_path / "c.sock", [], threading.Event()
+
+    def look():
+        while not stop.is_set():
+            with socket.socket(socket.AF_UNIX) as client:
+                client.setblocking(False)
+                try:
+                    client.connect(str(path))
+                except (FileNotFoundError, BlockingIOError):
+                    continue
+                except OSError as error:
+                    refused.append(error)
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    listeners = []
+    for _ in range(300):
+        listeners.append(_camera.listen(path))
+        path.unlink()
+    stop.set()
+    looking.join()
+    for listener in listeners:
+        listener.close()
+    assert not refused, refused[:3]
+
+
 def test_what_is_no_frame_is_named(tmp_path):
     with pytest.raises(TypeError, match=r"uint8 or uint16, this one is float64 of shape \(2, 2\)"):
         cellpos.serve_camera([np.zeros((2, 2))], 1000.0, tmp_path / "c.sock", real_time=False)
@@ -112,10 +141,11 @@ def firmware_sim() -> Path:
 def box(tmp_path):
     """firmware-sim, and a rig that sees it through `python.sock`. Times are those of a machine that tests share."""
     text = (ROOT / "examples/rig.toml").read_text()
-    for key, value in (("oldest_ms", 60.0), ("faults_in_a_row", 1000), ("lost_ticks", 20000), ("watchdog_ms", 100)):
+    for key, value in (("oldest_ms", 60.0), ("faults_in_a_row", 100000), ("lost_ticks", 20000), ("board_silence_ms", 2000.0)):
         text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
     (tmp_path / "rig.toml").write_text(text)
     (tmp_path / "python.toml").write_text(text.replace('"camera.sock"', '"python.sock"'))
+    (tmp_path / "inside.toml").write_text("first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 100000\n")
     words = [firmware_sim(), "--rig", "rig.toml", "--pty-link", "pzt", "--socket", "camera.sock", "--duration", "60s"]
     child = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     for _ in range(200):
@@ -141,8 +171,9 @@ def held_over(folder: Path, script: str, *words: str):
     """A bead held over a camera that an example serves from a separate process."""
     env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path), PYLON_CAMEMU="1")
     server = subprocess.Popen(
-        [sys.executable, ROOT / "examples/python" / script, *words], cwd=folder, env=env, stdout=subprocess.PIPE, text=True
-    )
+        [sys.executable, ROOT / "examples/python" / script, *words],
+        cwd=folder, env=env, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
     try:
         for _ in range(300):
             if (folder / "python.sock").exists() or server.poll() is not None:
@@ -151,37 +182,81 @@ def held_over(folder: Path, script: str, *words: str):
         time.sleep(0.5)
         # One after the other: two readers of the box would take each other's time.
         direct, through = watched(folder, "camera.sock"), watched(folder, "python.sock")
-        for _ in range(3):
-            result = cellpos.track("0um", "6s", rig="python.toml", best_effort=True, cwd=folder).wait()
-            # A machine that stalls for longer than the board waits ends a run in Safe, as it must: then once more.
-            if result.ended == "done" and result["rms_measured_nm"] is not None:
-                break
+        result = cellpos.track("0um", "6s", rig="python.toml", cwd=folder).wait()
     finally:
         server.send_signal(2)
         said, _ = server.communicate(timeout=10)
         print(said)
-    print(f"held over Python: {result['rms_measured_nm']} nm RMS as measured (PI in one process: 58), {result['frames_lost']} frames lost of {result['ticks']}")
-    return direct, through, result, said
+    inside = cellpos.track("0um", "3s", controller="pi", clock="real", rig="inside.toml", cwd=folder).wait()
+    nm = shown("over Python", result)
+    shown("in one process", inside)
+    return direct, through, result, nm, said
 
 
-def assert_held(result):
-    """The loop was closed over these frames. How well it held is a figure of the machine, which is printed and not judged:
-    a bead that nobody holds is 2 um away after six seconds, one held in one process 0.058 um."""
+def shown(name, result):
+    """Jitter, age and losses of a run's frames, and the error where the machine kept its times, nm."""
+    ticks = result.run.ticks
+    time_s, period_s = ticks["time_s"], 1e-3
+    frames = np.flatnonzero(np.diff(ticks["frame_id"], prepend=-1) != 0)
+    interval_ms, age_ms = 1e3 * np.diff(ticks["mid_exposure_s"][frames]), 1e3 * (time_s - ticks["mid_exposure_s"])[frames]
+    # A tick each period, or the next, on a frame that came in time; 0.1 s after anything else the PI loop has forgotten it.
+    good = (np.diff(time_s, prepend=0) < 2.5 * period_s) & (time_s - ticks["mid_exposure_s"] < 5e-3)
+    kept = kept_for(good, 100) & result.run.settled()
+    nm = 1e3 * np.sqrt(np.nanmean(result.run.error_um[kept] ** 2)) if kept.any() else np.nan
+
+    def quantiles(values):
+        return "p50 {:.3f} p99 {:.3f} max {:.2f} ms".format(*np.nanpercentile(values, [50, 99, 100]))
+
+    print(
+        f"{name:15} interval {quantiles(interval_ms)}, age {quantiles(age_ms)}, {result['frames_lost']} of {result['ticks']} frames lost,"
+        f" {nm:.0f} nm RMS in {np.count_nonzero(kept)} ticks"
+    )
+    return nm
+
+
+def assert_held(result, nm):
+    """The loop was closed over these frames: a bead that nobody holds is 2 um away after six seconds, PI in one process holds 0.058 um.
+    Frames over Python are as much older as the machine lets them be."""
     assert result.ended == "done", result.values_["ended"]
-    assert result["rms_measured_nm"] < 500
+    assert nm < 500
 
 
 def test_a_bead_is_held_over_a_rendered_stream(box):
-    direct, through, result, said = held_over(box, "rendered_stream.py", "camera.sock", "python.sock")
-    assert_held(result)
+    _, through, result, nm, said = held_over(box, "rendered_stream.py", "camera.sock", "python.sock")
+    assert_held(result, nm)
     assert through["interval_ms"]["p50"] == pytest.approx(1.0, abs=0.3)
     assert "jitter" in said and "dropped" in said
 
 
+BARE = """import time
+from pypylon import pylon
+camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateFirstDevice())
+camera.Open()
+camera.Width.Value, camera.Height.Value = 256, 32
+camera.ExposureTimeAbs.Value, camera.AcquisitionFrameRateEnable.Value, camera.AcquisitionFrameRateAbs.Value = 500, True, 1000
+camera.StartGrabbing(pylon.GrabStrategy_LatestImageOnly)
+begun, frames = time.monotonic(), 0
+while time.monotonic() < begun + 1:
+    camera.RetrieveResult(2000, pylon.TimeoutHandling_ThrowException).Release()
+    frames += 1
+print(frames)
+"""
+
+
+def pylon_alone() -> float:
+    """Frames per second of the emulator without anything of this package: its own threads make them, as fast as the machine lets them."""
+    return float(subprocess.check_output([sys.executable, "-c", BARE], env=dict(os.environ, PYLON_CAMEMU="1")))
+
+
 def test_a_bead_is_held_over_the_basler_emulator(box):
     pytest.importorskip("pypylon")
-    _, _, result, said = held_over(box, "pylon_camera.py", "python.sock", "--bead", "camera.sock")
-    assert_held(result)
+    before = pylon_alone()
+    _, through, result, nm, said = held_over(box, "pylon_camera.py", "python.sock", "--bead", "camera.sock")
+    alone = min(before, pylon_alone())
+    if alone < 900:
+        pytest.skip(f"this machine is too busy for the emulator: alone it gives {alone:.0f} of 1000 frames/s")
+    assert_held(result, nm)
+    assert through["rate_hz"] > 800
     assert "jitter" in said
 
 

@@ -28,7 +28,7 @@ mid_um = 22.0
 
 
 def track(folder, duration):
-    return cellpos.track("0um", duration, rig="pair.toml", best_effort=True, cwd=folder).wait()
+    return cellpos.track("0um", duration, rig="pair.toml", cwd=folder).wait()
 
 
 @pytest.fixture

@@ -90,12 +90,16 @@ def listen(path: Path) -> socket.socket:
     except (FileNotFoundError, ConnectionRefusedError):
         path.unlink(missing_ok=True)
     listener = socket.socket(socket.AF_UNIX)
+    # It gets its name when it listens: who finds the name may connect.
+    made = path.with_name(f".{os.getpid():x}.{threading.get_ident() & 0xFFFF:x}")
     try:
-        listener.bind(str(path))
+        listener.bind(str(made))
+        listener.listen(1)
+        made.rename(path)
     except OSError as error:
         listener.close()
-        raise OSError(f"{path}: {error}; a socket's path has at most 107 bytes") from None
-    listener.listen(1)
+        made.unlink(missing_ok=True)
+        raise OSError(f"{path}: {error}; a socket's path has at most 100 bytes") from None
     listener.setblocking(False)
     return listener
 
