@@ -142,7 +142,7 @@ def made(program: Path, folder: Path) -> list[Path]:
     subprocess.run([program, "report", *cells, "--out", "comparison.html"], cwd=folder, check=True, stdout=subprocess.DEVNULL)
     # The montage is of the camera's pictures, which there are only in real time; a busy machine may be late as often as it likes.
     (folder / "film.toml").write_text(CLIPS + repeat.replace("times = 30", "times = 4"))
-    (folder / "patient.toml").write_text(rig.read_text() + "\n[timing]\nfaults_in_a_row = 100000\n")
+    (folder / "patient.toml").write_text("first_neutral_um = 20.0\n" + rig.read_text() + "\n[timing]\nfaults_in_a_row = 100000\n")
     film = "run film.toml --rig patient.toml --clock real --best-effort --name film"
     subprocess.run([program, *film.split()], cwd=folder, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     line = [program, "report", "latest-film", "--out", "film.html"]

@@ -319,7 +319,12 @@ impl Clues {
                         format!(" (it takes {vision_ms:.1} ms a frame of {period_ms:.1})")
                     }),
                 format!("new frames not older than {} ms", timing.oldest_ms),
-                "choose a smaller region (origin_px, width_px), a lower frame rate, or a faster machine",
+                if expected.cell {
+                    "record the empty channel again if its region, light or focus changed (cellpos background): a background that does not \
+                     fit costs vision time; else choose a smaller region, a lower frame rate, or a faster machine"
+                } else {
+                    "choose a smaller region (origin_px, width_px), a lower frame rate, or a faster machine"
+                },
             ),
             SafeReason::Stalled => sentences(
                 " (more than a second)",

@@ -22,12 +22,13 @@ impl FramesSeen {
         clock: &Clock,
         span_ns: i64,
     ) -> Result<Self, Failure> {
-        // The queued frames are old.
-        while source
-            .next(clock.now_ns())
-            .map_err(Failure::failed)?
-            .is_some()
-        {}
+        // The queued frames are old. Where vision is slower than the camera the queue is never empty.
+        let begun_ns = clock.now_ns();
+        while let Some(m) = source.next(clock.now_ns()).map_err(Failure::failed)? {
+            if m.mid_exposure_ns >= begun_ns || clock.now_ns() - begun_ns >= span_ns {
+                break;
+            }
+        }
         let until_ns = clock.now_ns().saturating_add(span_ns);
         let (mut first, mut last) = (None, None);
         let mut ages_ms = Vec::new();
@@ -51,5 +52,65 @@ impl FramesSeen {
             rate_hz,
             age_ms: ages_ms.get(ages_ms.len() / 2).copied(),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_rig::{CameraError, Measurement, SourceInfo};
+    use std::time::Duration;
+
+    /// A camera of 1 kHz before a vision that takes 50 ms: a frame always waits.
+    struct Slow {
+        clock: Clock,
+        frames: u64,
+    }
+
+    impl PositionSource for Slow {
+        fn next(&mut self, _: i64) -> Result<Option<Measurement>, CameraError> {
+            self.frames += 1;
+            assert!(self.frames < 100, "the look never ends");
+            let mid_exposure_ns = self.clock.now_ns();
+            self.clock.sleep(Duration::from_millis(50));
+            Ok(Some(Measurement {
+                frame_id: self.frames,
+                mid_exposure_ns,
+                ready_ns: self.clock.now_ns(),
+                position_um: 0.0,
+                variance_um2: 1e-4,
+                verdict: cellpos_vision::FixQuality::Good,
+                track: None,
+                snr: 10.0,
+                length_um: f64::NAN,
+                area_um2: f64::NAN,
+                length_sd_um: f64::NAN,
+                area_sd_um2: f64::NAN,
+                true_um: f64::NAN,
+                true_pzt_um: f64::NAN,
+            }))
+        }
+        fn info(&self) -> SourceInfo {
+            SourceInfo {
+                name: "slow".to_owned(),
+                width_px: 0,
+                height_px: 0,
+                rate_hz: 1000.0,
+                latency_ms: 0.0,
+                field_um: [-10.0, 10.0],
+            }
+        }
+    }
+
+    #[test]
+    fn a_look_ends_although_vision_is_slower_than_the_camera() {
+        let clock = Clock::virtual_at(0);
+        let mut slow = Slow {
+            clock: clock.clone(),
+            frames: 0,
+        };
+        let seen = FramesSeen::of(&mut slow, &clock, 500_000_000).expect("frames");
+        assert_eq!(seen.age_ms, Some(50.0));
+        assert!(clock.now_ns() < 1_200_000_000);
     }
 }

@@ -53,13 +53,18 @@ impl LiveLine {
         let mut parts: Vec<Part> = vec![
             (4, format!("{:.2}s", record.time_ns as f64 * 1e-9)),
             (0, state.to_string()),
-            (0, format!("error {error_nm:+.0}nm")),
         ];
+        // Before the first position there is no error.
+        if error_nm.is_finite() {
+            parts.push((0, format!("error {error_nm:+.0}nm")));
+        }
         if let Some(rms_nm) = statistics.rms_measured_nm() {
             parts.push((3, format!("rms {rms_nm:.1}nm")));
         }
         parts.push((5, format!("target {:+.3}um", record.target_um)));
-        parts.push((6, format!("bead {:+.3}um", record.measured_um)));
+        if record.measured_um.is_finite() {
+            parts.push((6, format!("bead {:+.3}um", record.measured_um)));
+        }
         parts.push((1, format!("PZT {:.2}um", record.command_um)));
         if record.flags.has(TickFlags::PARTNER_LOST) {
             parts.push((1, "slow actuator MISSING".to_string()));
@@ -120,6 +125,24 @@ mod tests {
             ..TickRecord::unknown()
         };
         line.text(&record, &Statistics::default(), 0, columns)
+    }
+
+    #[test]
+    fn a_line_without_a_position_has_no_numbers_for_it() {
+        let line = LiveLine {
+            low_um: 0.0,
+            high_um: 40.0,
+            keys: "",
+            typed: Typed::default(),
+        };
+        let record = TickRecord {
+            life: Life::Armed as u8,
+            target_um: 0.0,
+            command_um: 20.0,
+            ..TickRecord::unknown()
+        };
+        let text = line.text(&record, &Statistics::default(), 0, 200);
+        assert!(text.contains("armed") && !text.contains("NaN"), "{text}");
     }
 
     #[test]

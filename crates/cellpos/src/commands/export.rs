@@ -101,7 +101,7 @@ fn chosen(args: &Args) -> Result<ExportFormat, Failure> {
     match (args.format, named) {
         (Some(asked), Some(named)) if asked != named => Err(Failure::bad_input(
             format!(
-                "--format {} and --out ….{}: which of the two?",
+                "--format {} and a file that ends in .{}: which of the two?",
                 asked.extension(),
                 named.extension()
             ),
@@ -110,7 +110,7 @@ fn chosen(args: &Args) -> Result<ExportFormat, Failure> {
         (Some(format), _) | (None, Some(format)) => Ok(format),
         (None, None) => match args.out.as_deref().and_then(Path::extension) {
             Some(ending) if !is_device(args.out.as_deref()) => Err(Failure::bad_input(
-                format!("--out ….{}: there is no such format", ending.display()),
+                format!("--out: there is no such format as .{}", ending.display()),
                 "end the name in .csv, .parquet, .h5, .mat or .rtdc, or say which it is with --format",
             )),
             _ => Ok(ExportFormat::Csv),

@@ -9,7 +9,7 @@ use crate::output;
 use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_plant::Model;
 use cellpos_plant::effects::{self, Definition};
-use cellpos_reconcile::{NoiseKind, Options, Reconciliation, Units, Verdict, figure_of};
+use cellpos_reconcile::{Gap, NoiseKind, Options, Reconciliation, Units, Verdict, figure_of};
 use cellpos_workbench::experiment::collect::{self, Collected, Collecting};
 use cellpos_workbench::experiment::on_rig::OnRig;
 use cellpos_workbench::foreign::{columns, form};
@@ -285,13 +285,18 @@ fn write(args: &Args, result: &Reconciliation, collected: &[Collected]) -> Resul
         let records = heading(args.data.iter().map(PathBuf::as_path).chain(collected));
         let model = match &args.base {
             Some(_) => "a linear model fitted to the records".to_owned(),
+            None if args.model == "fit" => "a constant gain fitted to the records".to_owned(),
             None => format!("the model {}", args.model),
+        };
+        let name = match args.model.as_str() {
+            "fit" => "a constant gain",
+            model => model,
         };
         let title = match (&args.base, args.data.len() + count) {
             (Some(_), 1) => "what one record has beyond a linear model".to_owned(),
             (Some(_), n) => format!("what {n} records have beyond a linear model"),
-            (None, 1) => format!("{} against one record", args.model),
-            (None, n) => format!("{} against {n} records", args.model),
+            (None, 1) => format!("{name} against one record"),
+            (None, n) => format!("{name} against {n} records"),
         };
         let lead = format!(
             "Task: find what {model} lacks, compared with {records}. Each effect of a catalogue was added to the model, fitted to a part of \
@@ -404,13 +409,28 @@ fn proposal_path(out: &Path) -> PathBuf {
     out.with_extension("effects.toml")
 }
 
+/// The free run of a plant that integrates wanders with the noise: a difference is stated only if it exceeds that.
+fn free_run(g: &Gap) -> String {
+    let (f, unit) = (cellpos_reconcile::figure, &g.unit);
+    let of = "gap on held-out records, RMS of free run:  ";
+    let [before, after, floor] = [g.free_run_before, g.free_run_after, g.free_run_floor].map(f);
+    match g.free_run_after < g.free_run_before {
+        true => format!(
+            "{of} {before} {unit} before, {after} {unit} after, noise alone about {floor} {unit}\n"
+        ),
+        false => format!(
+            "{of} decides nothing here: {before} to {after} {unit}, of which noise alone makes about {floor} {unit}\n"
+        ),
+    }
+}
+
 fn summary(result: &Reconciliation) -> String {
     use std::fmt::Write as _;
     let mut s = format!("verdict: {}\n", result.verdict.word());
     for e in &result.effects {
         let _ = writeln!(
             s,
-            "  {} (at the {}), explains {:.1} % of the excess",
+            "  {} (at the {}); without it {:.1} % of the excess comes back",
             e.id,
             e.place,
             100.0 * e.explained
@@ -462,12 +482,6 @@ fn summary(result: &Reconciliation) -> String {
         f(g.floor),
         result.floor.words()
     );
-    let _ = writeln!(
-        s,
-        "gap on held-out records, RMS of free run:   {} {unit} before, {} {unit} after, noise alone about {} {unit}",
-        f(g.free_run_before),
-        f(g.free_run_after),
-        f(g.free_run_floor)
-    );
+    s.push_str(&free_run(g));
     s
 }

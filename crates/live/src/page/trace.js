@@ -45,7 +45,7 @@ export function number(value, span) {
   return (Math.abs(value) < 1e-12 ? 0 : value).toFixed(digits);
 }
 
-const LEFT = 74, RIGHT = 10, TOP = 8, BOTTOM = 26, GAP = 12;
+const LEFT = 74, RIGHT = 10, TOP = 8, BOTTOM = 26, GAP = 12, LINE = 15;
 // What can be drawn. A panel that is bound to zero keeps it in its middle or at its foot.
 export const PANELS = [
   { id: "position", name: "Position", unit: "µm", share: 1.4, series: [["measured", "position", "position"], ["target", "target", "target"]] },
@@ -102,11 +102,16 @@ export class Traces {
       const found = panel.series.map(([key]) => reduce(rows, rows[key], first, last, from, to, columns));
       const bound = panel === HOLDING && this.bound !== null ? this.bound : null;
       const [low, high] = this.scales[panel.id] ?? limits(panel, found, bound);
-      this.drawn.push({ id: panel.id, top, bottom: top + tall, low, high });
-      const y = value => top + tall - (value - low) / (high - low) * tall;
-      grid(context, panel, { low, high, y, top, tall, width });
+      const names = panel.series.map(([, label, paint]) => [label, paint]);
+      if (bound !== null) names.push([`lowest possible RMS, ${bound.toFixed(1)} nm`, "target"]);
+      // The names have lines of their own: a curve is never behind them.
+      const told = legend(context, names, width), head = told.lines * LINE + 2;
+      const upper = top + head, plot = tall - head;
+      this.drawn.push({ id: panel.id, top: upper, bottom: top + tall, low, high });
+      const y = value => top + tall - (value - low) / (high - low) * plot;
+      grid(context, panel, { low, high, y, top: upper, tall: plot, width });
       context.save();
-      context.beginPath(); context.rect(LEFT, top, plotWidth, tall); context.clip();
+      context.beginPath(); context.rect(LEFT, upper, plotWidth, plot); context.clip();
       if (bound !== null) {
         context.strokeStyle = colour("target"); context.lineWidth = 1.2; context.setLineDash([6, 4]); context.beginPath();
         context.moveTo(LEFT, y(bound)); context.lineTo(width - RIGHT, y(bound)); context.stroke(); context.setLineDash([]);
@@ -114,15 +119,8 @@ export class Traces {
       panel.series.forEach(([, , paint], n) => stroke(context, found[n], colour(paint), y, isRed() && ["target", "zero-flow"].includes(paint)));
       context.restore();
       context.textAlign = "left"; context.textBaseline = "top";
-      let at = LEFT + 6, line = top + 1;
-      const names = panel.series.map(([, label, paint]) => [label, paint]);
-      if (bound !== null) names.push([`lowest possible RMS, ${bound.toFixed(1)} nm`, "target"]);
-      for (const [label, paint] of names) {
-        const long = context.measureText(label).width;
-        if (at + long > width - RIGHT && at > LEFT + 6) { at = LEFT + 6; line += 15; } // a narrow screen
-        context.fillStyle = colour("card"); context.fillRect(at - 2, line, long + 4, 15);
-        context.fillStyle = colour(paint); context.fillText(label, at, line + 1);
-        at += long + 14;
+      for (const { label, paint, at, line } of told.placed) {
+        context.fillStyle = colour(paint); context.fillText(label, at, top + line * LINE);
       }
       top += tall + GAP;
     }
@@ -150,6 +148,19 @@ export class Traces {
       + (isFinite(rows.area[k]) ? `, area ${say(rows.area[k], 2)} µm²` : "")
       + `, wake-up ${say(rows.wake[k], 0)} µs, computing ${say(rows.compute[k], 0)} µs`;
   }
+}
+
+// Places of a panel's names, in as many lines as a narrow screen needs.
+function legend(context, names, width) {
+  const placed = [];
+  let at = LEFT + 6, line = 0;
+  for (const [label, paint] of names) {
+    const long = context.measureText(label).width;
+    if (at + long > width - RIGHT && at > LEFT + 6) { at = LEFT + 6; line += 1; }
+    placed.push({ label, paint, at, line });
+    at += long + 14;
+  }
+  return { placed, lines: line + 1 };
 }
 
 // Ends of a panel's scale, from its data.

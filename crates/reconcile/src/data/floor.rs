@@ -33,8 +33,12 @@ impl FloorSource {
             Self::Rest => "measured at rest",
             Self::Periods => "measured between periods of the command",
             Self::EqualRecords => "measured between records of the same command",
-            Self::Stated => "stated in the model, not measured",
-            Self::Unknown => "not known: no rest, no repeated command, no stated noise",
+            Self::Stated => {
+                "stated in the model: no record has a rest of the command or repeats it for long enough"
+            }
+            Self::Unknown => {
+                "not known: no rest of the command, no repeated command, no stated noise"
+            }
         }
     }
 

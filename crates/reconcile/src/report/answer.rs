@@ -14,6 +14,10 @@ fn number(name: &str, found: &Interval) -> String {
         "rad/s" => "_rad_per_s",
         "1/s" => "_per_s",
         "1/um" => "_per_um",
+        unit if unit.contains("units") => ["_per_um2", "_per_um", "_um_per_s", "_um"]
+            .into_iter()
+            .find(|suffix| name.ends_with(suffix))
+            .unwrap_or(""),
         _ => "",
     };
     let name = name.strip_suffix(suffix).unwrap_or(name).replace('_', " ");
@@ -32,10 +36,15 @@ fn number(name: &str, found: &Interval) -> String {
 
 /// An effect with its first numbers in one clause: "time-delay at the camera, delay = 2.0 ms (95 %: 1.9 to 2.1)".
 fn clause(e: &Effect) -> String {
-    let numbers: String = (e.parameters.iter())
-        .take(2)
-        .map(|(name, found)| format!(", {}", number(name, found)))
-        .collect();
+    /// An effect of more numbers is a curve: they say nothing one by one.
+    const SAID: usize = 4;
+    let numbers: String = match e.parameters.len() {
+        0..=SAID => (e.parameters.iter())
+            .take(2)
+            .map(|(name, found)| format!(", {}", number(name, found)))
+            .collect(),
+        many => format!(" (a curve of {many} numbers, below)"),
+    };
     let or = match e.alternatives.is_empty() {
         true => String::new(),
         false => format!(", or {}", e.alternatives.join(" or ")),
@@ -110,8 +119,8 @@ fn sure(result: &Reconciliation) -> String {
         format!("the probability that chance made what was found, in the whole search, is {p}. Intervals are those of the fit. ")
     });
     let floor = match result.floor.is_known() {
-        true => "The noise floor is known from the records or the model",
-        false => "The noise floor is what the fit leaves, as no record tells it",
+        true => format!("The noise floor is {}", result.floor.words()),
+        false => "The noise floor is what the fit leaves, as no record tells it".to_owned(),
     };
     format!(
         "{chance}Prediction errors (RMS, one sample ahead) are of parts of the records that the fit had not seen. {floor}."

@@ -153,7 +153,7 @@ fn numbers(r: &mut Report, result: &Reconciliation) {
         Column::left("effect"),
         Column::left("place"),
         Column::left("parameters (95 % interval)"),
-        Column::right("explains"),
+        Column::right("needed for"),
         Column::right("p"),
         Column::left("or"),
     ]);
@@ -173,6 +173,10 @@ fn numbers(r: &mut Report, result: &Reconciliation) {
             e.alternatives.join(", "),
         ]);
     }
+    t.caption(
+        "Needed for: the part of the excess over the noise floor that comes back without this effect. What any of several effects can \
+         take is nobody's, so the parts need not add up to 100 %. Or: effects that explain these records as well.",
+    );
     r.table(t);
 }
 
@@ -307,7 +311,7 @@ fn gap(r: &mut Report, result: &Reconciliation) {
     let g = &result.gap;
     let (factor, unit) = fine(result);
     r.paragraph(&format!(
-        "On held-out records: {} before, {} after, floor {} RMS of innovation; closure {:.1} %.",
+        "On held-out records: {} before, {} after, floor {} RMS of innovation; {:.1} % of the excess over the floor is closed.",
         small(result, g.before),
         small(result, g.after),
         small(result, g.floor),
@@ -375,7 +379,8 @@ fn innovations(r: &mut Report, result: &Reconciliation) {
             &format!(
                 "Prediction error by frequency band: the part of each band, of the model as it was and with the effects added, and the part \
                  that noise alone has (points; by chance a band is a little below it). The squares of the parts add up to the square of the \
-                 whole: {} before, {} after, {} of noise, of all records together, each counting alike.",
+                 whole: {} before, {} after, {} of noise, of all records together, each counting alike, and of all of each record: \
+                 the sentence above is of the parts that the fit had not seen.",
                 whole(|b| b.before),
                 whole(|b| b.after),
                 whole(|b| b.floor)

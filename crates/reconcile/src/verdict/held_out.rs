@@ -264,9 +264,15 @@ fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
 }
 
 /// RMS innovation per band before and after, all records together.
-pub(crate) fn bands(before: &DiscrepancyMap, after: &DiscrepancyMap) -> Vec<BandGap> {
+pub(crate) fn bands(
+    before: &DiscrepancyMap,
+    after: &DiscrepancyMap,
+    nyquist_hz: f64,
+) -> Vec<BandGap> {
     let n = BAND_EDGES_HZ.len() - 1;
+    // Records have no frequency above half their rate.
     (0..n)
+        .filter(|b| BAND_EDGES_HZ[*b] < nyquist_hz)
         .map(|b| {
             let rms = |m: &DiscrepancyMap| {
                 let cells: Vec<f64> = m
@@ -280,7 +286,7 @@ pub(crate) fn bands(before: &DiscrepancyMap, after: &DiscrepancyMap) -> Vec<Band
             let floor = before.rows.first().map_or(0.0, |r| r.cells[b].floor_um);
             BandGap {
                 low_hz: BAND_EDGES_HZ[b],
-                high_hz: BAND_EDGES_HZ[b + 1],
+                high_hz: BAND_EDGES_HZ[b + 1].min(nyquist_hz),
                 before: rms(before),
                 after: rms(after),
                 floor,

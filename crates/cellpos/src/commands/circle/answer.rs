@@ -60,8 +60,14 @@ fn lacks(circle: &Circle) -> String {
     }
 }
 
-/// The delay of the loop as identified and as reconciled, both from the middle of an exposure to the tick that uses it, ms.
-fn delays(circle: &Circle) -> Option<String> {
+/// A delay and its 95 % interval, ms.
+struct Delay {
+    ms: f64,
+    ci95: [f64; 2],
+}
+
+/// The delay of the loop as identified and as reconciled, both from the middle of an exposure to the tick that uses it.
+fn delays(circle: &Circle) -> Option<[Delay; 2]> {
     let judged = &circle.identified.result.judged;
     let identified = judged.parameter("effective_delay_ms")?;
     let added = (circle.reconciled.effects.iter())
@@ -71,12 +77,37 @@ fn delays(circle: &Circle) -> Option<String> {
     let stage = circle.stages.last()?;
     // Half the exposure comes on top of what was added.
     let rest_ms = stage.delay_ms - 1e3 * added.value;
-    let [low, high] = added.ci95.map(|s| 1e3 * s + rest_ms);
-    let [from, to] = identified.ci95;
+    let identified = Delay {
+        ms: identified.value,
+        ci95: identified.ci95,
+    };
+    let reconciled = Delay {
+        ms: stage.delay_ms,
+        ci95: added.ci95.map(|s| 1e3 * s + rest_ms),
+    };
+    Some([identified, reconciled])
+}
+
+/// Whether the intervals of the two delays exclude each other.
+pub(super) fn delays_differ(circle: &Circle) -> bool {
+    delays(circle).is_some_and(|[a, b]| a.ci95[1] < b.ci95[0] || b.ci95[1] < a.ci95[0])
+}
+
+fn delays_text(circle: &Circle) -> Option<String> {
+    let [identified, reconciled] = delays(circle)?.map(
+        |Delay {
+             ms,
+             ci95: [from, to],
+         }| {
+            (
+                format!("{ms:.3} ms"),
+                format!("(95 %: {from:.3} to {to:.3})"),
+            )
+        },
+    );
     Some(format!(
-        " Delay from a frame's exposure to its use: {:.3} ms identified (95 %: {from:.3} to {to:.3}), {:.3} ms reconciled (95 %: {low:.3} \
-         to {high:.3}).",
-        identified.value, stage.delay_ms
+        " Delay from a frame's exposure to its use: {} identified {}, {} reconciled {}.",
+        identified.0, identified.1, reconciled.0, reconciled.1
     ))
 }
 
@@ -123,7 +154,7 @@ fn verdict(signs: &[i8]) -> String {
 /// What came out.
 pub(super) fn sentence(circle: &Circle) -> (Emphasis, String) {
     let mut text = lacks(circle);
-    if let Some(delays) = delays(circle) {
+    if let Some(delays) = delays_text(circle) {
         text.push_str(&delays);
     }
     let mut gain = 0;

@@ -1,6 +1,6 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
-use super::answer::{RUNS, error, rms, sentence, verdict_and_names};
+use super::answer::{RUNS, delays_differ, error, rms, sentence, verdict_and_names};
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_session::provenance::command_text;
 use cellpos_workbench::experiment::circle::Circle;
@@ -165,10 +165,14 @@ pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
     ));
     let (status, sentence) = sentence(circle);
     r.result(status, &sentence);
-    r.certainty(
+    r.certainty(&format!(
         "\u{b1} is the 95 % interval that one run of each gives, from the scatter of its error over tenths of a second; the first two seconds \
-         are left out. Before: the controller of the given model; after: that of the corrected one. Intervals of a delay: 95 % of the fit.",
-    );
+         are left out. Before: the controller of the given model; after: that of the corrected one. Intervals of a delay: 95 % of the fit{}.",
+        match delays_differ(circle) {
+            true => ", which hold if the model is right; they exclude each other, so one of the two models is not",
+            false => "",
+        }
+    ));
     r.figure(errors(circle));
 
     r.section("Identified");
@@ -219,6 +223,14 @@ fn reconciled(r: &mut Report, circle: &Circle, gap: &Path) {
             parameters.join("; "),
             e.alternatives.join(", "),
         ]);
+    }
+    if circle
+        .reconciled
+        .effects
+        .iter()
+        .any(|e| e.id == "time-delay")
+    {
+        t.caption("The delay in the table is that of the effect alone; the sentence above counts from the middle of an exposure and has half of it more.");
     }
     r.table(t);
     let g = &circle.reconciled.gap;

@@ -359,11 +359,11 @@ impl ScriptSink {
         if let Some(stretch) = self.stretch {
             amplitude.push_str(&format!("  stretch {stretch:.2}"));
         }
-        format!(
-            "{cycle}  {stage}  {} left{amplitude}  error {:+.0}nm",
-            time(left_s),
-            r.error_um * 1e3
-        )
+        let error = match r.error_um.is_finite() {
+            true => format!("  error {:+.0}nm", r.error_um * 1e3),
+            false => String::new(),
+        };
+        format!("{cycle}  {stage}  {} left{amplitude}{error}", time(left_s))
     }
 }
 
