@@ -127,6 +127,16 @@ pub(crate) struct Expected {
 const NO_CELL: &str = "bring a cell into view and into focus, then start again; if one is in view, the background may be of another \
     region, light or focus: record the empty channel again (cellpos background)";
 
+/// Remedy if vision is slower than the camera. A background that does not fit makes objects of every wall.
+fn slow_vision(cell: bool) -> &'static str {
+    if cell {
+        "record the empty channel again if its region, light or focus changed (cellpos background); else choose a smaller region, a lower \
+         frame rate, or a faster machine"
+    } else {
+        "choose a smaller region (origin_px, width_px), a lower frame rate, or a faster machine"
+    }
+}
+
 /// Three sentences: observation, expectation, remedy.
 type Sentences = (String, String, String);
 
@@ -319,12 +329,7 @@ impl Clues {
                         format!(" (it takes {vision_ms:.1} ms a frame of {period_ms:.1})")
                     }),
                 format!("new frames not older than {} ms", timing.oldest_ms),
-                if expected.cell {
-                    "record the empty channel again if its region, light or focus changed (cellpos background): a background that does not \
-                     fit costs vision time; else choose a smaller region, a lower frame rate, or a faster machine"
-                } else {
-                    "choose a smaller region (origin_px, width_px), a lower frame rate, or a faster machine"
-                },
+                slow_vision(expected.cell),
             ),
             SafeReason::Stalled => sentences(
                 " (more than a second)",
