@@ -265,7 +265,8 @@ def machine_kept_its_times(ticks):
     picture as old as the rig file says, within a tenth of a period, and each command obeyed before the next."""
     time_s, commands, applied = (ticks[name] for name in ("time_s", "pzt_um", "applied_um"))
     tenth_s = 0.1e-3 * PERIOD_MS
-    good = (ticks["life"] == "running") & (ticks["request"] == "none") & (time_s - ticks["mid_exposure_s"] < 2e-3 + tenth_s)
+    good = (ticks["life"] == "running") & (ticks["request"] == "none") & (ticks["flags"] & cellpos.FLAGS["timer"] == 0)
+    good &= time_s - ticks["mid_exposure_s"] < 2e-3 + tenth_s
     good[1:] &= np.abs(np.diff(time_s) - 1e-3 * PERIOD_MS) < tenth_s
     good[:-1] &= np.abs(applied[1:] - commands[:-1]) < 1e-3
     good[-1:] = False

@@ -193,11 +193,10 @@ def test_clips_are_pictures_with_times(tmp_path):
 def test_a_clip_of_a_real_run_opens(here, tmp_path):
     script = 'name = "clip"\n[clips]\ncycles = [1, 3]\nbefore = "50ms"\nafter = "50ms"\n[[step]]\ndo = "sine"\n'
     (tmp_path / "clip.toml").write_text(script + 'amplitude = "1um"\nfrequency = "5Hz"\ncycles = 5\n')
-    for _ in range(4):
-        result = cellpos.run("clip.toml", cwd=tmp_path).result
-        # A machine that stalls ends a run in real time in Safe, as it must: then once more.
-        if result.ended == "reference-over":
-            break
+    # A machine that others use is late for longer than a rig may be.
+    (tmp_path / "rig.toml").write_text("first_neutral_um = 20.0\n[timing]\nfaults_in_a_row = 100000\n")
+    result = cellpos.run("clip.toml", rig="rig.toml", cwd=tmp_path).result
+    assert result.ended == "reference-over"
     clips = result.run.clips
     assert len(clips) >= 2, clips
     clip = next(iter(clips.values()))
