@@ -52,7 +52,7 @@ impl Localiser {
             FixQuality::NoSignal
         } else if !f.converged || !kept {
             FixQuality::NotConverged
-        } else if residual_ratio > self.tolerated(snr) {
+        } else if residual_ratio > self.tolerated_now(snr) {
             FixQuality::BadFit
         } else {
             self.whole(frame, (f.x_px, f.y_px))
@@ -89,16 +89,34 @@ impl Localiser {
         noise.max(shape)
     }
 
-    /// What the template explains of what the bead adds to the window, and what it leaves, in variances of the noise.
+    /// The part of the bead's contrast in the window that the template explains, and the part that it leaves, in variances of the noise.
     fn explained(&self, fix: &Fix) -> (f64, f64) {
-        let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
         let left = (fix.residual_ratio - 1.0).max(0.0);
-        (filled * MEASURED * fix.snr * fix.snr, left)
+        (self.contrast_of(fix.snr), left)
+    }
+
+    /// Mean square of a bead's contrast in the window, in variances of the noise.
+    fn contrast_of(&self, snr: f64) -> f64 {
+        let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
+        filled * MEASURED * snr * snr
     }
 
     /// Residual ratio up to which a template's error explains the residual of a bead of this contrast over the noise.
     fn tolerated(&self, snr: f64) -> f64 {
         self.config.max_residual_ratio + self.tolerated_error(snr)
+    }
+
+    /// The same with the share of a bead's contrast that the last good fixes left unexplained. A codec leaves less noise at the border of
+    /// a window, where it is read off, than on a bead. Beyond the settings' own tolerance the template must explain half of the contrast.
+    /// Only for narrow beads: there the last fixes also widen the variance of the contrast, so that no more of the noise passes.
+    fn tolerated_now(&self, snr: f64) -> f64 {
+        let (by_settings, contrast) = (self.tolerated(snr), self.contrast_of(snr));
+        if self.template.radius_px() >= UNRESOLVED_PX {
+            return by_settings;
+        }
+        let usual = self.config.max_residual_ratio * self.unexplained.mean * contrast;
+        let half = LEAST_EXPLAINED / (1.0 - LEAST_EXPLAINED) * contrast;
+        (by_settings + usual).min(1.0 + half).max(by_settings)
     }
 
     /// The part of it that is the template's error.
@@ -144,6 +162,8 @@ impl Localiser {
     /// end of a ring that lies there counts as noise.
     fn narrow(&mut self, fix: &mut Fix) {
         self.ratio.take_in(fix.residual_ratio);
+        let (contrast, left) = self.explained(fix);
+        self.unexplained.take_in(left / contrast);
         if let PixelNoise::Estimated = self.config.noise {
             let factor = self.ratio.mean.clamp(0.5, 1.0);
             fix.var_x_px2 *= factor;

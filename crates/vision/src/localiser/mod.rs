@@ -73,6 +73,8 @@ pub struct Localiser {
     /// What the last fixes were widened by, and their residual ratios.
     widened: Pool,
     ratio: Pool,
+    /// Share of the beads' contrast in their windows that the last fixes left unexplained.
+    unexplained: Pool,
     /// How much the pictures of beads that the template fits badly answer to a motion: see [`Residues::besides_the_mean`].
     answers: Pool,
 }
@@ -120,6 +122,7 @@ impl Localiser {
             lines: [Pool::default(); 2],
             widened: Pool::default(),
             ratio: Pool::default(),
+            unexplained: Pool::default(),
             answers: Pool::default(),
         })
     }

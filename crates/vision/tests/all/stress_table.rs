@@ -324,3 +324,11 @@ fn a_few_rows_of_the_table_keep_their_limits() {
 fn each_way_to_spoil_a_picture_with_both_settings_keeps_its_limits() {
     few_rows(|_| true);
 }
+
+#[test]
+fn beads_of_a_few_pixels_are_found_in_pictures_of_a_codec() {
+    // The codec leaves no noise beside a bead. The block that holds the bead has the error of every coefficient.
+    let rows = [(40.0, Settings::Right), (200.0, Settings::Pasted)];
+    let rows = rows.map(|(snr, settings)| (0, snr, settings, Spoil::Jpeg));
+    run(&rows, 250.0);
+}
