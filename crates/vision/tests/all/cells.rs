@@ -259,6 +259,38 @@ fn a_cell_that_stretches_nearly_fourfold_and_recovers_is_followed_all_the_way() 
 }
 
 #[test]
+fn an_area_that_changes_by_over_a_fifth_from_frame_to_frame_is_not_taken_without_a_word() {
+    let (mut run, mut random) = (Run::new(11), Random(12));
+    let (mut before, mut refused) = (None, 0);
+    for n in 0..200 {
+        // Three frames of every ten have another area.
+        let other = n > 10 && n % 10 < 3;
+        let area = if other {
+            0.6 + 0.8 * random.uniform()
+        } else {
+            1.0
+        };
+        let at = Drawn::at(120.0);
+        let (length, width) = (at.length * area.sqrt(), at.width * area.sqrt());
+        let step = run.see(&[Drawn {
+            length,
+            width,
+            ..at
+        }]);
+        let now = step.cell.map(|cell| cell.area_px);
+        if let (Some(before), Some(now), Decision::Accepted) = (before, now, step.track.decision) {
+            assert!(
+                (1.0 / 1.2..1.2).contains(&(now / before)),
+                "{n}: {now} {before}"
+            );
+        }
+        refused += usize::from(other && now.is_none());
+        before = now;
+    }
+    assert!(refused > 10, "{refused}");
+}
+
+#[test]
 fn two_cells_that_touch_are_not_taken_and_the_right_one_comes_back() {
     let mut run = Run::new(4);
     let own = Drawn::at(80.0);
