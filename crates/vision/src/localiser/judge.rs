@@ -1,4 +1,4 @@
-//! What a fit is worth: its verdict, and the variance of its place.
+//! The verdict on a fit, and the variance of its place.
 
 use super::certainty::LEAST_SIGNIFICANCE;
 use super::{Fitted, Localiser, NARROW_RADII};
@@ -10,14 +10,15 @@ use crate::left::Left;
 use crate::residue::POOLED_FIXES;
 use crate::template::Template;
 
-/// Residual ratio from which the variance is judged by the residual: noise alone does not reach it; and the same of the pixels
-/// that tell the place, few in a narrow bead, over the last fixes: noise alone varies by 0.06.
+/// Residual ratio from which the residual gives the variance. Noise alone does not reach it.
 pub(super) const WIDENED_RATIO: f64 = 1.3;
+/// Residual ratio of the pixels that tell the place, over the last fixes. A narrow bead has few of these pixels; noise alone varies by
+/// 0.06.
 const WIDENED_LOCALLY: f64 = 1.2;
 /// Mean square of the measured ring about its mean in its window of 25 px (`the_measured_bead_fills_its_window...`).
 const MEASURED: f64 = 0.135;
 
-/// Radius of a bead that patches of whole pixels do not resolve: what the template leaves in the pixels where the place is read off counts.
+/// Radius of a bead that patches of whole pixels do not resolve. Then the residual of the pixels that tell the place counts.
 const UNRESOLVED_PX: f64 = 2.5;
 /// Square of the least answer of a picture to a motion of the bead, over the template's: below, noise decides.
 const LEAST_ANSWER: f64 = 0.04;
@@ -106,8 +107,9 @@ impl Localiser {
         self.config.max_residual_ratio + self.tolerated_error(snr)
     }
 
-    /// The same with the share of a bead's contrast that the last good fixes left unexplained. A codec leaves less noise at the border of
-    /// a window, where it is read off, than on a bead. Beyond the settings' own tolerance the template must explain half of the contrast.
+    /// The same with the share of a bead's contrast that the last good fixes left unexplained. Noise is read off the border of a window,
+    /// and a codec leaves less noise there than on a bead. Beyond the settings' own tolerance the template must explain half of the
+    /// contrast.
     /// Only for narrow beads: there the last fixes also widen the variance of the contrast, so that no more of the noise passes.
     fn tolerated_now(&self, snr: f64) -> f64 {
         let (by_settings, contrast) = (self.tolerated(snr), self.contrast_of(snr));
@@ -119,7 +121,7 @@ impl Localiser {
         (by_settings + usual).min(1.0 + half).max(by_settings)
     }
 
-    /// The part of it that is the template's error.
+    /// The part of the tolerated residual ratio that is the template's error.
     pub(super) fn tolerated_error(&self, snr: f64) -> f64 {
         let filled = self.filled[usize::from(self.crop.width < self.config.window_px)];
         filled * (self.template_tolerance() * snr).powi(2)
@@ -158,8 +160,8 @@ impl Localiser {
         }
     }
 
-    /// Narrows a fix's covariance where the last fixes have left less than the noise that was read off the windows' borders: the
-    /// end of a ring that lies there counts as noise.
+    /// Narrows a fix's covariance if the last fixes have left less than the noise of the windows' borders. The end of a ring at the
+    /// border counts as noise.
     fn narrow(&mut self, fix: &mut Fix) {
         self.ratio.take_in(fix.residual_ratio);
         let (contrast, left) = self.explained(fix);
@@ -172,7 +174,7 @@ impl Localiser {
         }
     }
 
-    /// Widens a good fix's covariance by what the template leaves of the window; by how much.
+    /// Widens a good fix's covariance by the template's residual, and returns the factor.
     pub(super) fn widen(&mut self, fix: &mut Fix, left: &Left) -> f64 {
         if fix.verdict != FixQuality::Good {
             return 1.0;
