@@ -123,7 +123,7 @@ def made(program: Path, folder: Path) -> list[Path]:
     (folder / "tire.toml").write_text(repeat + '[[step]]\ndo = "static"\nlike = "cyclic"\nload = "mean"\n')
     fast = "--clock virtual --frames off"
     for line in (
-        f"track --target 0um --duration 12s {fast} --name hold",
+        f"track --target 0um --duration 12s {fast} --seed 2 --name hold",
         f"track --target 0um --sine 5um@20Hz --controller lqg --learn --duration 8s {fast} --name sine",
         f"run tire.toml --rig {rig} {fast} --name tire",
         f"run tire.toml --rig {rig} {fast} --cells 3 --name queue",

@@ -78,7 +78,7 @@ def adapt(bench: Bench, figures: Figures):
         for state in ("on", "off"):
             runs = track(bench, f"--target 0um --rig other-rig.toml --controller lqg --adapt {state} --duration 20s --frames off")
             figures.put(f"adapt.{factor:g}-{state}", f"hold on a plant of {factor:g} times the model's gain, adaptation {state}", mean(runs, "rms_true_nm"), "nm", 1,
-                        "cellpos track --controller lqg --adapt STATE on such a rig, 20 s, seeds 1 to 5")
+                        "cellpos track --controller lqg --adapt STATE --rig other-rig.toml, 20 s, seeds 1 to 5")
 
 
 def cell(bench: Bench, figures: Figures):

@@ -215,6 +215,30 @@ fn a_run_of_track_is_data_wherever_its_bead_rested() {
 }
 
 #[test]
+fn emulated_runs_that_share_their_noise_are_no_data_for_each_other() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, seed) in [("one", 7), ("two", 7), ("three", 8)] {
+        let line = format!(
+            "track --target 0um --sine 3um@10Hz --duration 1s --clock virtual --frames off --seed {seed} --name {name}"
+        );
+        succeed(folder.path(), &line);
+    }
+    let ran = common::cellpos(
+        folder.path(),
+        "reconcile --model eq6 --data latest-one latest-two --out a.toml",
+    );
+    assert_eq!(ran.code, Some(2), "{}", ran.err);
+    for says in ["-one", "-two", "`seed` = 7", "--seed 8"] {
+        assert!(ran.err.contains(says), "{says}: {}", ran.err);
+    }
+    let ran = common::cellpos(
+        folder.path(),
+        "reconcile --model eq6 --data latest-one latest-three --out a.toml",
+    );
+    assert!(!ran.err.contains("share one noise"), "{}", ran.err);
+}
+
+#[test]
 fn frames_that_came_without_a_fix_are_no_dropped_frames() {
     let folder = tempfile::tempdir().unwrap();
     // The bead is hidden for 8 ms, ten times a second: its frames come, and show nothing.

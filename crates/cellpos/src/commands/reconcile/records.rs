@@ -10,6 +10,7 @@ use cellpos_session::sessions;
 use cellpos_workbench::experiment::collect::{neutral_um, refused};
 use cellpos_workbench::experiment::on_rig::{frame_age_ns, frames_passed_over, is_unseen};
 use cellpos_workbench::foreign::columns::{self, Wanted};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Where CSV files have what, and in which units.
@@ -82,6 +83,7 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             ));
         }
     }
+    each_its_own_noise(&found)?;
     // A run that was resumed has a record for each of its sessions.
     Ok((found.iter())
         .flat_map(|path| match is_run(path) {
@@ -89,6 +91,31 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             false => vec![path.clone()],
         })
         .collect())
+}
+
+/// Runs of the emulated rig with one seed share one noise: the second would confirm whatever fits the noise of the first.
+fn each_its_own_noise(found: &[PathBuf]) -> Result<(), Failure> {
+    let mut seeds: BTreeMap<u64, &Path> = BTreeMap::new();
+    for path in found.iter().filter(|path| is_run(path)) {
+        let run = RunReader::open(path).map_err(Failure::input)?;
+        let Some(seed) = run.meta().ok().and_then(|meta| meta.seed) else {
+            continue;
+        };
+        if let Some(first) = seeds.insert(seed, path) {
+            return Err(Failure::bad_input(
+                format!(
+                    "--data: {} and {} are runs of the emulated rig with the same `seed` = {seed}: they share one noise",
+                    first.display(),
+                    path.display()
+                ),
+                format!(
+                    "record one of them again with --seed {}",
+                    seed.wrapping_add(1)
+                ),
+            ));
+        }
+    }
+    Ok(())
 }
 
 pub(super) fn is_run(path: &Path) -> bool {

@@ -245,7 +245,7 @@ fn the_objects_of_slow_commands_fit_their_schemas() {
     );
     succeed(
         at,
-        "track --target 0um --duration 6s --clock virtual --frames off --name hold",
+        "track --target 0um --duration 6s --clock virtual --frames off --seed 2 --name hold",
     );
     for line in [
         "identify --clock virtual --seed 3 --frames off --out fitted.toml",
