@@ -25,7 +25,7 @@ use transition::Transition;
 pub use config::EstimatorConfig;
 pub(crate) use config::planned_gap;
 pub use covariance::ZERO_FLOW_WALK_UM_PER_SQRT_S;
-pub use flow_step::flow_step_log_density;
+pub use flow_step::{RecentFixes, flow_step_log_density};
 pub use stuck::StillBead;
 pub use transition::PredictedState;
 
@@ -80,6 +80,8 @@ pub struct EstimatorState {
     pub gated: u8,
     /// Ticks since the newest measurement that was used.
     pub ticks_since_fix: u8,
+    /// What the last fixes say of a step of the flow.
+    pub recent: RecentFixes,
     /// Ticks for which a step of the flow that was granted counts as new.
     pub stepped_ticks: u8,
     /// A measurement has been used.
@@ -202,6 +204,7 @@ impl Estimator {
             lag: 0,
             gated: 0,
             ticks_since_fix: 0,
+            recent: RecentFixes::default(),
             stepped_ticks: 0,
             seen: false,
             stuck: false,
@@ -408,9 +411,9 @@ impl Estimator {
             state.stuck = false;
         }
         state.gated = 0;
-        if self.is_step(state, innovation, spread, fix) {
-            self.grant_step(state, innovation);
-            self.correct(state, h, innovation, walk_um2, fix.variance_um2);
+        if let Some(step) = self.flow_step(state, [innovation, motion_um], spread, fix) {
+            let left_um = self.grant_step(state, &step, h, innovation);
+            self.correct(state, h, left_um, walk_um2, fix.variance_um2);
             return (true, innovation);
         }
         if beyond {
@@ -446,6 +449,7 @@ impl Estimator {
         for covariance_um2 in [&mut state.covariance_um2, &mut state.stated_um2] {
             (covariance_um2[0], covariance_um2[1]) = (variance_um2, 0.0);
         }
+        state.recent.forget();
         state.gated = 0;
         state.seen = true;
     }

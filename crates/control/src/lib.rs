@@ -64,8 +64,8 @@ pub use control_loop::{ControlLoop, LoopState};
 pub use controller::{Controller, ControllerConfig, LoopConfig};
 pub use error::{BuildError, Parameter};
 pub use estimator::{
-    Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState, StillBead,
-    ZERO_FLOW_WALK_UM_PER_SQRT_S, flow_step_log_density,
+    Estimate, Estimator, EstimatorConfig, EstimatorState, HISTORY, PredictedState, RecentFixes,
+    StillBead, ZERO_FLOW_WALK_UM_PER_SQRT_S, flow_step_log_density,
 };
 pub use feedforward::FeedForwardState;
 pub use law::{

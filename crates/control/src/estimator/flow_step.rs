@@ -1,9 +1,8 @@
 //! A step of the flow, as a hypothesis beside the quiet walk of neutral.
 //!
-//! A tap on the syringe or a valve moves neutral at once by what a walk would take minutes for. A fix that the quiet model
-//! hardly grants is weighed under both: the normal density of the innovation, and a step since the last fix that was used, of
-//! any magnitude on a logarithmic scale. Where the step is likelier, neutral is as uncertain as the step that the innovation
-//! shows, and the filter learns the new one from the fixes that follow.
+//! A tap on the syringe or a valve moves neutral at once by what a walk would take minutes for. Where the last fixes are off together is
+//! weighed under both: the normal density of the sum of their innovations, and a step before any of them, of any magnitude on a
+//! logarithmic scale. A fast flow shows in one fix, a slow one in several. Where a step is likelier, neutral moves by what it would take.
 
 use super::covariance::corrected;
 use super::{Estimator, EstimatorState, Fix, HISTORY};
@@ -16,10 +15,49 @@ const STEPS_PER_S: f64 = 0.01;
 const LOG_RANGE: f64 = 6.0;
 /// No fix is better than that: nearer than it no step is told, um.
 const LEAST_OFF_UM: f64 = 1e-3;
-/// An innovation of up to so many times what the last commands moved the bead in a tick can come from a plant that is not the
-/// model's: a gain that jumps from half to twice is four times what the law has followed and adds the motion three times; a tick
-/// of delay where the motion turns round makes it twice that.
-const MOTION_SHARE: f64 = 6.0;
+/// Gain of a plant over that of its model, of either sign, that is told from a step of the flow: a gain that jumps from half to twice is
+/// four times what the law has followed.
+const WRONG_GAIN: f64 = 4.0;
+
+/// What the last fixes showed, newest first, since the zero flow was last believed to be quiet.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct RecentFixes {
+    fixes: [RecentFix; HISTORY],
+    count: usize,
+}
+
+/// How far the bead went from one fix to the next.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct RecentFix {
+    /// Fix less its prediction, um.
+    innovation_um: f64,
+    /// The way that the commands account for, um.
+    motion_um: f64,
+    ticks: f64,
+}
+
+impl RecentFixes {
+    fn push(&mut self, fix: RecentFix) {
+        self.fixes.copy_within(0..HISTORY - 1, 1);
+        self.fixes[0] = fix;
+        self.count = (self.count + 1).min(HISTORY);
+    }
+
+    pub(super) fn forget(&mut self) {
+        self.count = 0;
+    }
+}
+
+/// A step of the flow that explains the last fixes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct FlowStep {
+    /// The way that it has carried the bead, with its variance, um and um^2.
+    way_um: f64,
+    variance_um2: f64,
+    /// Ticks since then, and those of the newest fix.
+    ticks: f64,
+    newest_ticks: f64,
+}
 
 /// Natural logarithm of the density (1/um) of a fix that is `off_um` from where a quiet flow would have it, if the flow has stepped
 /// within the last `since_s`: any speed is as likely as any other on a logarithmic scale.
@@ -29,27 +67,64 @@ pub fn flow_step_log_density(off_um: f64, since_s: f64) -> f64 {
 }
 
 impl Estimator {
-    /// Whether a step of the flow since the last fix that was used explains an innovation better than the quiet model does, in
-    /// which its variance is `variance_um2`. At 1 kHz that is from about 5.3 standard deviations on. What the bead's own motion
-    /// of the last ticks could explain, by a gain or a delay that is wrong, is no step.
-    pub(super) fn is_step(
+    /// The step of the flow before one of the last fixes that explains them best, if it does so better than the quiet model, in which the
+    /// variance of the newest innovation is `variance_um2`. One fix shows it at 1 kHz from about 5.3 standard deviations on. What the
+    /// bead's own motion could explain, by a gain or a delay that is wrong, is no step.
+    pub(super) fn flow_step(
         &self,
-        state: &EstimatorState,
-        innovation_um: f64,
+        state: &mut EstimatorState,
+        [innovation_um, motion_um]: [f64; 2],
         variance_um2: f64,
         fix: &Fix,
-    ) -> bool {
-        if state.stuck || innovation_um.abs() <= MOTION_SHARE * self.commanded_swing(state) {
-            return false;
+    ) -> Option<FlowStep> {
+        if state.stuck {
+            state.recent.forget();
+            return None;
         }
+        state.recent.push(RecentFix {
+            innovation_um,
+            motion_um,
+            ticks: f64::from(state.ticks_since_fix.max(1)),
+        });
+        let sample_s = self.model.sample_time_s;
+        let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * sample_s;
+        // What is not known of neutral carries the bead the same way in every tick.
+        let unsure_um2 = self.tick.gain.powi(2) * state.covariance_um2[2];
+        let swing_um = WRONG_GAIN * self.commanded_swing(state);
         // Of a fix that is not of its nominal time the tick may have come late as well, and the walk of a tick is in doubt.
         let late = fix.age > 0 || fix.offset != 0.0;
-        let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * self.model.sample_time_s;
-        let variance_um2 = variance_um2 + if late { walk_um2 } else { 0.0 };
-        let quiet =
-            -0.5 * (innovation_um * innovation_um / variance_um2 + (TAU * variance_um2).ln());
-        let since_s = f64::from(state.ticks_since_fix.max(1)) * self.model().sample_time_s;
-        flow_step_log_density(innovation_um, since_s) > quiet
+        let mut variance_um2 = variance_um2 + if late { walk_um2 } else { 0.0 };
+        let newest_ticks = state.recent.fixes[0].ticks;
+        let (mut way_um, mut motion_um, mut ticks) = (0.0, 0.0, 0.0);
+        let mut best: Option<(f64, FlowStep)> = None;
+        for (back, recent) in state.recent.fixes[..state.recent.count].iter().enumerate() {
+            way_um += recent.innovation_um;
+            motion_um += recent.motion_um;
+            ticks += recent.ticks;
+            if back > 0 {
+                let before = ticks - recent.ticks;
+                variance_um2 += (walk_um2 + state.spread_um2) * recent.ticks
+                    + unsure_um2 * (ticks * ticks - before * before);
+            }
+            let by_gain = [-WRONG_GAIN - 1.0, WRONG_GAIN - 1.0].map(|more| more * motion_um);
+            let low_um = by_gain[0].min(by_gain[1]) - swing_um;
+            let high_um = by_gain[0].max(by_gain[1]) + swing_um;
+            if (low_um..=high_um).contains(&way_um) {
+                continue;
+            }
+            let quiet = -0.5 * (way_um * way_um / variance_um2 + (TAU * variance_um2).ln());
+            let odds = flow_step_log_density(way_um, recent.ticks * sample_s) - quiet;
+            if odds > best.map_or(0.0, |(odds, _)| odds) {
+                let step = FlowStep {
+                    way_um,
+                    variance_um2,
+                    ticks,
+                    newest_ticks,
+                };
+                best = Some((odds, step));
+            }
+        }
+        best.map(|(_, step)| step)
     }
 
     /// What the swing of the last commands moves a bead in a tick, um. It does not lean on neutral, which may be what is wrong.
@@ -63,16 +138,28 @@ impl Estimator {
         self.tick.gain.abs() * (high_um - low_um)
     }
 
-    /// Neutral may have stepped at any time since the last fix that was used, by what has carried the bead this far.
-    pub(super) fn grant_step(&self, state: &mut EstimatorState, innovation_um: f64) {
+    /// Neutral has moved by what has carried the bead this far, and the prediction of the newest fix with it; `h` is the sensitivity of
+    /// a fix to neutral. Returns what is left of the innovation.
+    pub(super) fn grant_step(
+        &self,
+        state: &mut EstimatorState,
+        step: &FlowStep,
+        h: f64,
+        innovation_um: f64,
+    ) -> f64 {
         state.stepped_ticks = HISTORY as u8;
-        let way_per_um = self.tick.gain * f64::from(state.ticks_since_fix.max(1));
-        let step_um = innovation_um / way_per_um;
+        state.recent.forget();
+        // Per um of way: of the newest fix's prediction, and of neutral.
+        let newest = step.newest_ticks / step.ticks;
+        let neutral = -1.0 / (self.tick.gain * step.ticks);
+        state.integrator_um += newest * step.way_um;
+        state.neutral_um += neutral * step.way_um;
         for covariance_um2 in [&mut state.covariance_um2, &mut state.stated_um2] {
-            covariance_um2[0] += innovation_um * innovation_um;
-            covariance_um2[1] -= innovation_um * step_um;
-            covariance_um2[2] += step_um * step_um;
+            covariance_um2[0] += newest * newest * step.variance_um2;
+            covariance_um2[1] += newest * neutral * step.variance_um2;
+            covariance_um2[2] += neutral * neutral * step.variance_um2;
         }
+        innovation_um - (newest + h * neutral) * step.way_um
     }
 
     /// Corrects the estimate by an innovation; `h` is the sensitivity of the fix to neutral.

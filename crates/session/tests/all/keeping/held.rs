@@ -9,8 +9,8 @@ use cellpos_session::setup::ReferenceSpec;
 use cellpos_session::{Finished, Options, Rig, RigFile};
 use std::fmt;
 
-/// Speed of the flow in the end for a zero flow that is 1 um off, Eq. (6), 1/s: it begins with 379 of them.
-pub(super) const GAIN_PER_S: f64 = 428.0;
+/// Speed with which a flow begins for a zero flow that is 1 um off, Eq. (6), 1/s: a row is named by it.
+pub(super) const GAIN_PER_S: f64 = 379.3;
 /// Where the bead rests before a step of the flow, um; it wanders by some nm.
 const ZERO_FLOW_UM: f64 = 20.0;
 /// Start of the first event, and its errors count from there, s.
