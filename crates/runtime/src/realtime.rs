@@ -36,6 +36,14 @@ impl Request {
         }
     }
 
+    /// What a measurement before a run asks for: to be as late as the control thread will be.
+    pub fn like_control() -> Self {
+        Self {
+            lock_memory: false,
+            ..Self::control_thread()
+        }
+    }
+
     /// What the threads around it ask for: a FIFO priority below control, on control's CPU. A frame wakes one thread after the other.
     /// Waking a thread on another CPU takes an interrupt: 0.2 to 0.4 ms if that CPU sleeps on a virtual machine, 1 us on the same CPU.
     pub fn io_thread(priority: u8) -> Self {
@@ -93,6 +101,16 @@ pub fn allowed_cpus() -> Vec<usize> {
 fn first_line(path: &str) -> Option<String> {
     let text = std::fs::read_to_string(path).ok()?;
     Some(text.lines().next().unwrap_or("").trim().to_string())
+}
+
+/// Does some work on a thread of its own with a request applied, and waits for it.
+pub fn with<T: Send>(request: &Request, work: impl FnOnce() -> T + Send) -> T {
+    let work = || {
+        apply(request);
+        work()
+    };
+    std::thread::scope(|scope| scope.spawn(work).join())
+        .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
 }
 
 /// Applies a request to the calling thread and says what was obtained.

@@ -2,22 +2,57 @@
 
 use crate::failure::Failure;
 use cellpos_rig::{Clock, PositionSource};
+use cellpos_runtime::realtime::{self, Request};
+use serde::Serialize;
 
 /// Rate and age of a camera's frames, from their own ids and time stamps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FramesSeen {
     /// Frames a second; 0 with fewer than two.
     pub rate_hz: f64,
-    /// From the middle of an exposure until the loop can use its frame, vision included, ms, median.
-    pub age_ms: Option<f64>,
+    /// From the middle of an exposure until the loop can use its frame, vision included; `None` without frames.
+    pub age: Option<FrameAge>,
+}
+
+/// How old frames are when they can be used, ms. A machine that stalls makes them older, never younger.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct FrameAge {
+    /// One in ten is younger: the path itself, without what the machine adds.
+    pub early_ms: f64,
+    /// The median.
+    pub median_ms: f64,
+}
+
+impl FrameAge {
+    /// Of ages in any order, ms.
+    fn of(mut ages_ms: Vec<f64>) -> Option<Self> {
+        ages_ms.sort_by(f64::total_cmp);
+        let at = |part: usize| ages_ms.get(ages_ms.len() / part).copied();
+        Some(Self {
+            early_ms: at(10)?,
+            median_ms: at(2)?,
+        })
+    }
 }
 
 impl FramesSeen {
-    /// Watches `source` for `span_ns`.
+    /// Watches `source` for `span_ns`; on the real clock from a thread of the priority `request`, as the loop will.
     ///
     /// # Errors
     /// The camera delivers nothing more.
     pub fn of(
+        source: &mut dyn PositionSource,
+        clock: &Clock,
+        span_ns: i64,
+        request: &Request,
+    ) -> Result<Self, Failure> {
+        if matches!(clock, Clock::Virtual(_)) {
+            return Self::watched(source, clock, span_ns);
+        }
+        realtime::with(request, || Self::watched(source, clock, span_ns))
+    }
+
+    fn watched(
         source: &mut dyn PositionSource,
         clock: &Clock,
         span_ns: i64,
@@ -41,7 +76,6 @@ impl FramesSeen {
             last = Some(at);
             ages_ms.push((m.ready_ns - m.mid_exposure_ns) as f64 * 1e-6);
         }
-        ages_ms.sort_by(f64::total_cmp);
         let rate_hz = match (first, last) {
             (Some((id, ns)), Some((last_id, last_ns))) if last_ns > ns => {
                 last_id.saturating_sub(id) as f64 / ((last_ns - ns) as f64 * 1e-9)
@@ -50,7 +84,7 @@ impl FramesSeen {
         };
         Ok(Self {
             rate_hz,
-            age_ms: ages_ms.get(ages_ms.len() / 2).copied(),
+            age: FrameAge::of(ages_ms),
         })
     }
 }
@@ -109,8 +143,9 @@ mod tests {
             clock: clock.clone(),
             frames: 0,
         };
-        let seen = FramesSeen::of(&mut slow, &clock, 500_000_000).expect("frames");
-        assert_eq!(seen.age_ms, Some(50.0));
+        let seen = FramesSeen::of(&mut slow, &clock, 500_000_000, &Request::best_effort());
+        let age = seen.expect("frames").age.expect("an age");
+        assert_eq!((age.early_ms, age.median_ms), (50.0, 50.0));
         assert!(clock.now_ns() < 1_200_000_000);
     }
 }

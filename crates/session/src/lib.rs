@@ -70,7 +70,7 @@ pub mod words;
 pub use devices::Options;
 pub use ended::{EndKind, Ended};
 pub use failure::Failure;
-pub use frames_seen::FramesSeen;
+pub use frames_seen::{FrameAge, FramesSeen};
 pub use rig::{Armed, Finished, NotArmed, Rig, Running};
 pub use rig_file::RigFile;
 

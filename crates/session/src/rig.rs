@@ -18,7 +18,7 @@ use cellpos_rig::{
     Actuator, ActuatorInfo, ArmRequest, Clock, FrameWatch, PositionSource, SourceInfo,
 };
 use cellpos_runtime::live::{Operator, Threads};
-use cellpos_runtime::realtime::Conditions;
+use cellpos_runtime::realtime::{Conditions, Request};
 use cellpos_runtime::recorder::RecorderReport;
 use cellpos_runtime::{
     Core, EndRule, Hold, ReferenceGenerator, RunError, RunSink, Statistics, Summary, live,
@@ -112,7 +112,16 @@ impl Rig {
     /// The camera delivers nothing more.
     pub fn look(&mut self, span_ns: i64) -> Result<FramesSeen, Failure> {
         let connected = &mut self.devices.connected;
-        FramesSeen::of(connected.source.as_mut(), &connected.clock, span_ns)
+        let request = match self.options.best_effort {
+            true => Request::best_effort(),
+            false => Request::like_control(),
+        };
+        FramesSeen::of(
+            connected.source.as_mut(),
+            &connected.clock,
+            span_ns,
+            &request,
+        )
     }
 
     /// The handle that requests freeze, park and pause of the next run on this rig.

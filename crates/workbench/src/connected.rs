@@ -5,9 +5,11 @@ use crate::finding::{Finding, Found, Weight};
 use crate::line_test::{self, LineTest, Quantiles};
 use cellpos_drivers::Axis;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
+use cellpos_runtime::Timing;
+use cellpos_runtime::realtime::Request;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
 use cellpos_session::setup::camera_delay_advice;
-use cellpos_session::{Failure, FramesSeen, RigFile};
+use cellpos_session::{Failure, FrameAge, FramesSeen, RigFile};
 use serde::Serialize;
 use std::path::Path;
 
@@ -33,8 +35,8 @@ pub struct CameraSeen {
     pub rate_hz: f64,
     /// From mid-exposure to arrival, ms.
     pub age_ms: Quantiles,
-    /// From mid-exposure to the end of vision's work, ms, median; none if vision is not set up.
-    pub used_ms: Option<f64>,
+    /// From mid-exposure to the end of vision's work; none if vision is not set up.
+    pub used: Option<FrameAge>,
 }
 
 /// Opens board and camera of a rig file that was read from `path`. Nothing moves. A device that is missing or does not answer is
@@ -102,20 +104,21 @@ fn camera(bench: &Bench) -> Result<CameraSeen, Failure> {
     let rate_hz = ages_ms.len() as f64 / ((clock.now_ns() - start_ns) as f64 * 1e-9);
     let name = camera.info().name;
     // As the loop takes them: through vision.
-    let used_ms = bench
+    let used = bench
         .file()
         .watch(camera, &clock)
         .ok()
         .and_then(|mut source| {
-            let seen = FramesSeen::of(source.as_mut(), &clock, WATCH_NS / 2).ok()?;
-            seen.age_ms
+            let request = Request::like_control();
+            let seen = FramesSeen::of(source.as_mut(), &clock, WATCH_NS / 2, &request).ok()?;
+            seen.age
         });
     Ok(CameraSeen {
         name,
         size_px: [buffer.width, buffer.height],
         rate_hz,
         age_ms: Quantiles::of(ages_ms),
-        used_ms,
+        used,
     })
 }
 
@@ -232,18 +235,47 @@ fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
             },
         );
     }
-    let advice = seen
-        .age_ms
-        .and_then(|age_ms| camera_delay_advice(age_ms, &file.timing));
-    if let Some(advice) = advice {
+    if let Some((advice, remedy)) = seen.age.and_then(|age| of_age(age, &file.timing)) {
         found.say(
             Weight::Warning,
             ("timing", "camera_delay_ms"),
             &file.timing.camera_delay_ms,
             advice,
-            "design the controller again, too: cellpos design --rig",
+            remedy,
         );
     }
+}
+
+/// What the age of the frames says against the file, and the remedy. A machine that stalls makes frames older: if that alone is worth
+/// saying, no value is advised, and a file that may be right is not blamed.
+fn of_age(age: FrameAge, timing: &Timing) -> Option<(String, &'static str)> {
+    let FrameAge {
+        early_ms,
+        median_ms,
+    } = age;
+    let camera_delay_ms = timing.camera_delay_ms;
+    let advice = camera_delay_advice(median_ms, timing)?;
+    let undisturbed = Timing {
+        camera_delay_ms: early_ms,
+        ..*timing
+    };
+    if camera_delay_advice(median_ms, &undisturbed).is_none() {
+        return Some((
+            advice,
+            "design the controller again, too: cellpos design --rig",
+        ));
+    }
+    let between = (early_ms..=median_ms).contains(&camera_delay_ms);
+    if between || camera_delay_advice(early_ms, timing).is_none() {
+        return None;
+    }
+    Some((
+        format!(
+            "frames are {median_ms:.2} ms old when they are used (median), one in ten less than {early_ms:.2} ms: the machine is too busy \
+             to measure it, but camera_delay_ms = {camera_delay_ms} is wrong"
+        ),
+        "end other programs and check again: cellpos doctor --why names what is late",
+    ))
 }
 
 /// Rate and age of the frames against the loop's set-up; the calibration's origin against their size.
@@ -253,10 +285,13 @@ fn judge_camera(found: &mut Found, file: &RigFile, camera: &CameraSeen) {
         file,
         &FramesSeen {
             rate_hz: camera.rate_hz,
-            age_ms: camera.used_ms.or_else(|| {
+            age: camera.used.or_else(|| {
                 // A frame cannot be used before it arrives; without vision nothing more is known.
                 let arrived_ms = camera.age_ms.p50;
-                (arrived_ms > file.timing.camera_delay_ms).then_some(arrived_ms)
+                (arrived_ms > file.timing.camera_delay_ms).then_some(FrameAge {
+                    early_ms: arrived_ms,
+                    median_ms: arrived_ms,
+                })
             }),
         },
     );
@@ -345,7 +380,7 @@ mod tests {
                 p50: 2.0,
                 ..Quantiles::default()
             },
-            used_ms: None,
+            used: None,
         };
         let found = in_file(FILE, |found, file| {
             judge_board(found, file, &line);
@@ -366,6 +401,34 @@ mod tests {
             ("calibration.origin_px", Some(9)),
         ];
         assert_eq!(places, expected);
+    }
+
+    #[test]
+    fn the_lateness_of_a_busy_machine_is_not_advised_as_the_delay_of_the_camera() {
+        let said = |early_ms: f64, median_ms: f64, camera_delay_ms: f64| {
+            let timing = Timing {
+                camera_delay_ms,
+                ..Timing::default()
+            };
+            let age = FrameAge {
+                early_ms,
+                median_ms,
+            };
+            of_age(age, &timing).map(|(what, _)| what)
+        };
+        // An idle machine: the file is right, or the value is said.
+        assert_eq!(said(3.18, 3.24, 3.2), None);
+        assert!(said(3.18, 3.24, 2.0).is_some_and(|what| what.contains("= 3.24 and design")));
+        // Frames of 3.2 ms on a machine that adds 3 ms in the median.
+        assert_eq!(said(3.3, 6.3, 3.2), None);
+        assert_eq!(said(3.3, 6.3, 5.0), None);
+        for camera_delay_ms in [2.0, 7.0] {
+            let what = said(3.3, 6.3, camera_delay_ms).expect("a word");
+            assert!(
+                what.contains("too busy") && !what.contains("write"),
+                "{what}"
+            );
+        }
     }
 
     #[test]

@@ -18,7 +18,7 @@ use cellpos_plant::Model;
 use cellpos_record::RunWriter;
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
-use cellpos_runtime::{EndRule, Request, TickRecord};
+use cellpos_runtime::{EndRule, Request, TickRecord, realtime};
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::setup::{self, Prepared, ReferenceSpec};
 use cellpos_session::view::{Pages, Viewed};
@@ -353,6 +353,15 @@ impl OnRig {
 
     /// The LED test on a rig with a real board, which switches its LED at dithered instants in front of the camera.
     pub fn delay_test(&self, edges: usize, seed: u64) -> Result<DelayTest, Failure> {
+        // An LED that is switched later than a command counts for the delay.
+        let request = match self.best_effort {
+            true => realtime::Request::best_effort(),
+            false => realtime::Request::like_control(),
+        };
+        realtime::with(&request, || self.switched(edges, seed))
+    }
+
+    fn switched(&self, edges: usize, seed: u64) -> Result<DelayTest, Failure> {
         const APART_S: f64 = 0.011;
         const PINGS: u32 = 21;
         let (mut camera, mut board) = self.file.open_for_led()?;

@@ -231,7 +231,7 @@ fn on_rig(
     let mut warnings = Vec::new();
     let mut runs = Vec::new();
     let mut had_bead = false;
-    let mut neutral_um = rig.file.first_neutral_um;
+    let mut rig = rig.clone();
     let mut age_s = rig.file.timing.camera_delay_ms * 1e-3;
     let mut fix_noise_um = None;
     loop {
@@ -257,7 +257,10 @@ fn on_rig(
         } else {
             0
         };
-        neutral_um = acquired.neutral_um;
+        if !acquired.records.is_empty() {
+            // Where the zero flow has wandered meanwhile the flow is slow and a bead stays in view: the next run begins there.
+            rig.file.first_neutral_um = acquired.neutral_um;
+        }
         age_s = acquired.age_s.unwrap_or(age_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
         runs.extend(acquired.run.clone());
@@ -305,11 +308,11 @@ fn on_rig(
             "all segments are measured, and the model is being fitted.",
         );
     }
-    let led = led_delay(job, rig)?;
+    let led = led_delay(job, &rig)?;
     Ok(Raw {
         records,
         led,
-        neutral_um,
+        neutral_um: rig.file.first_neutral_um,
         age_s,
         fix_noise_um,
         warnings,
