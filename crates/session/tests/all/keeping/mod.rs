@@ -67,6 +67,8 @@ fn steps_of_the_flow_and_stalls_keep_the_bead_under_every_law_and_the_last_word_
         second_um: Some(1.5),
         ..Row::step("mpc", -379.0)
     });
+    // A flow that no single fix shows, under a law without an integral.
+    rows.push(Row::step("own", -114.0));
     rows.push(Row::event("lqg", "stall-camera", 0.15));
     rows.push(Row::event("mpc", "frozen-picture", 0.1));
     rows.push(Row::event("pi", "link-loss", 0.05));
