@@ -175,7 +175,7 @@ fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
     let r = ran.json();
     assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.02, "{r}");
     assert_eq!(r["frequencies"].as_array().unwrap().len(), 5);
-    // The second run begins where the flow stood still in the first: a bead stays in view there.
+    // Each further run begins where the flow stood still in the one before: a bead stays in view there.
     let runs = std::fs::read_dir(folder.path().join("runs")).unwrap();
     let began = |run: std::fs::DirEntry| {
         let text = std::fs::read_to_string(run.path().join("run.toml")).ok()?;
@@ -186,8 +186,11 @@ fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
     };
     let mut began: Vec<f64> = runs.filter_map(|run| began(run.unwrap())).collect();
     began.sort_by(f64::total_cmp);
-    assert_eq!((began.len(), began[0]), (2, 20.0), "{began:?}");
-    assert!((began[1] - 20.05).abs() < 0.02, "{began:?}");
+    assert!(began.len() > 1 && began[0] == 20.0, "{began:?}");
+    assert!(
+        (began[1..].iter()).all(|um| (um - 20.05).abs() < 0.02),
+        "{began:?}"
+    );
     let said = message(&ran);
     assert!(
         said.contains("not heard") && said.contains("measuring again what is missing"),
