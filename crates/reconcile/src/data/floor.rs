@@ -81,13 +81,28 @@ impl Estimate {
     fn sigma(&self) -> f64 {
         NoiseModel::from_increments(self.c0, self.c1).innovation_um()
     }
+
+    /// The most that the standard deviation is, by so many increments.
+    fn most(&self) -> f64 {
+        self.sigma() * (1.0 + error_of(self.rows))
+    }
+}
+
+/// Error of a noise's standard deviation from so many increments, in parts of it: three standard deviations, for of several estimates
+/// one is small by chance. A noise that was not measured is taken as it is stated.
+pub(crate) fn error_of(rows: usize) -> f64 {
+    match rows {
+        0 => 0.0,
+        rows => 3.0 / (2.0 * rows as f64).sqrt(),
+    }
 }
 
 /// Estimates both noises from residuals of the null model.
 ///
 /// A rest record shows the noise itself (lines at the mains frequency and a drift taken off); of a record whose command
 /// repeats, the difference of successive periods cancels every response that repeats, and so does the difference of two
-/// records of the same command. The smallest of these rules: a misfit can only add. Without any, what the model states is
+/// records of the same command. The one that is surely smallest rules, with those that differ from it by chance: a misfit can only
+/// add, and the smallest of several that are known badly is too small. Without any, what the model states is
 /// taken, as long as the records do not lie below it; and without that, the floor is not known, and the increments of the
 /// residuals stand in for the figures alone.
 pub(crate) fn estimate(
@@ -148,8 +163,8 @@ pub(crate) fn estimate(
         }
     }
     found.retain(counts);
-    if let Some(least) = found.iter().min_by(|a, b| a.sigma().total_cmp(&b.sigma())) {
-        let pooled = pooled(&found, least.sigma());
+    if let Some(least) = found.iter().min_by(|a, b| a.most().total_cmp(&b.most())) {
+        let pooled = pooled(&found, least);
         let walk = NoiseModel::from_increments(pooled.c0, pooled.c1);
         let alone = least.alone();
         return Floor {
@@ -161,9 +176,9 @@ pub(crate) fn estimate(
     own.retain(|f| f.rows >= 20 && f.c0 > 0.0);
     let residual = own
         .iter()
-        .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
+        .min_by(|a, b| a.most().total_cmp(&b.most()))
         .map(|least| {
-            let all = pooled(&own, least.sigma());
+            let all = pooled(&own, least);
             let walk = NoiseModel::from_increments(all.c0, all.c1);
             // What a base that was fitted to these records leaves is a sensor's noise or a slow disturbance: seldom a walk.
             choose(kind, walk, &least.alone()).at_least(quantum_um2)
@@ -230,9 +245,13 @@ fn between_periods(
     [(of_residuals, ok.clone()), (of_positions, ok)]
 }
 
-/// Those within 3 % of the least together.
-fn pooled(of: &[Estimate], least: f64) -> Estimate {
-    let near: Vec<&Estimate> = of.iter().filter(|f| f.sigma() <= 1.03 * least).collect();
+/// Those that differ from the least by chance together.
+fn pooled(of: &[Estimate], least: &Estimate) -> Estimate {
+    let by_chance = |f: &&Estimate| {
+        let error = error_of(f.rows).hypot(error_of(least.rows));
+        (f.sigma() / least.sigma() - 1.0).abs() <= error
+    };
+    let near: Vec<&Estimate> = of.iter().filter(by_chance).collect();
     let n: f64 = near.iter().map(|f| f.rows as f64).sum::<f64>().max(1.0);
     let mean =
         |get: fn(&Estimate) -> f64| near.iter().map(|f| get(f) * f.rows as f64).sum::<f64>() / n;
@@ -360,4 +379,36 @@ fn without_lines(e: &[f64], present: &[bool], sample_s: f64) -> Vec<f64> {
         }
     }
     clean
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn measured(sigma: f64, rows: usize) -> Estimate {
+        Estimate {
+            c0: sigma * sigma,
+            c1: 0.0,
+            rows,
+            source: FloorSource::Rest,
+            alone: Default::default(),
+            share: 1.0,
+        }
+    }
+
+    #[test]
+    fn a_stretch_that_is_quiet_by_chance_is_not_the_floor() {
+        // 481 rows know a standard deviation to 3.2 %.
+        let all = [measured(0.94, 481), measured(1.0, 20_000)];
+        let least = (all.iter().min_by(|a, b| a.most().total_cmp(&b.most()))).unwrap();
+        assert_eq!(least.rows, 20_000);
+        let floor = pooled(&all, least).sigma();
+        assert!((floor - 1.0).abs() < 0.005, "{floor}");
+        // What is larger by more than that is a misfit.
+        let floor = pooled(
+            &[measured(1.0, 481), measured(1.3, 20_000)],
+            &measured(1.0, 481),
+        );
+        assert!((floor.sigma() - 1.0).abs() < 1e-9);
+    }
 }

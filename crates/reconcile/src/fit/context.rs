@@ -19,6 +19,8 @@ pub(crate) struct Context<'a> {
     /// The base model's gain is free in every fit, the null included: a base fitted to these very records.
     pub free_gain: bool,
     pub white: Option<WhiteEvidence>,
+    /// Error of the standard deviation of a measured noise, in parts of it.
+    pub floor_error: f64,
     /// The positions come in steps that are not small beside their increments.
     pub quantised: bool,
     /// What the figures of the search are in the units of the records.
@@ -80,6 +82,8 @@ pub(crate) struct Fit {
     pub innovations: Vec<Vec<f64>>,
     /// Covariance of the parameters of the parts, in the fit's coordinates, in order.
     pub covariance: DMatrix<f64>,
+    /// Logarithm of the determinant of the information on all numbers of the fit, their ranges included.
+    pub log_information: f64,
 }
 
 impl Fit {

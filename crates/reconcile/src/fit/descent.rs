@@ -18,6 +18,9 @@ const WEIGHT_PRECISION: f64 = 100.0;
 const STILL: f64 = 0.02;
 const STILL_SHARE: f64 = 3e-6;
 
+/// Largest free factor on the base model's gain.
+const GAIN_RANGE: f64 = 20.0;
+
 /// Rounds before a fit may be given up: the first ones find their damping.
 const FEWEST: usize = 4;
 
@@ -60,7 +63,37 @@ fn covariance(information: &DMatrix<f64>) -> DMatrix<f64> {
     inverse
 }
 
+/// Logarithm of the determinant of an information matrix, with what the ranges of its numbers tell of each: a number that may be anything
+/// in a range has the variance `range^2 / 12`.
+fn log_information(mut information: DMatrix<f64>, ranges: &[f64]) -> f64 {
+    for (i, range) in ranges.iter().enumerate() {
+        information[(i, i)] += 12.0 / (range * range);
+    }
+    information.cholesky().map_or(f64::INFINITY, |c| {
+        2.0 * c.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>()
+    })
+}
+
 impl Context<'_> {
+    /// Ranges of all numbers of a fit, in its coordinates. Amplitudes lie within the travel of the bead.
+    fn ranges(&self, fit: &Fit, count: usize) -> Vec<f64> {
+        let mut ranges = Vec::with_capacity(count);
+        for part in &fit.parts {
+            let v = part.variant();
+            ranges.extend((v.params.iter()).map(|p| p.coordinate(p.upper) - p.coordinate(p.lower)));
+            let amplitudes = freedom_of(v, self.problem.records.len()) - v.params.len();
+            ranges.extend(std::iter::repeat_n(2.0 * self.scope.travel_um, amplitudes));
+        }
+        if self.has_free_offset(&fit.parts) {
+            ranges.push(2.0 * self.scope.stroke_um);
+        }
+        // The share of the edge, and a free gain.
+        let (low, high) = self.problem.soft;
+        ranges.push((high - low).max(1e-9));
+        ranges.resize(count, GAIN_RANGE);
+        ranges
+    }
+
     /// Fits a set of candidates from starting values.
     pub(crate) fn fit(&self, parts: Vec<Part>, mask: &Mask, iterations: usize) -> Fit {
         self.fit_from(parts, None, mask, iterations)
@@ -118,6 +151,7 @@ impl Context<'_> {
             count: self.problem.count(mask),
             innovations: Vec::new(),
             covariance: DMatrix::zeros(0, 0),
+            log_information: 0.0,
         };
         self.run(fit, mask, until)
     }
@@ -194,6 +228,7 @@ impl Context<'_> {
         } else {
             state.innovations
         };
+        fit.log_information = log_information(normal.clone(), &self.ranges(&fit, size));
         let inverse = covariance(&normal);
         let sd = |i: usize| inverse[(i, i)].max(0.0).sqrt();
         fit.errors = if self.free_gain {
@@ -255,7 +290,7 @@ impl Context<'_> {
         }
         t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);
         if self.free_gain {
-            t.gain = (t.gain + step[next + 1]).clamp(0.05, 20.0);
+            t.gain = (t.gain + step[next + 1]).clamp(0.05, GAIN_RANGE);
         }
         t
     }

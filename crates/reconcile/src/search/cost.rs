@@ -25,7 +25,7 @@ pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
 
 /// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
 pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
-    let left = left_over(fit);
+    let left = surely_left(ctx, fit);
     let typical: f64 = fit.parts.iter().map(|p| prior_penalty(p, left)).sum();
     // Decides ties only: the localisation noise of a rig need not be that of its model.
     let white = ctx
@@ -37,6 +37,12 @@ pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
 /// Sum of squares beyond the noise.
 pub(crate) fn left_over(fit: &Fit) -> f64 {
     (fit.chi2 - fit.count as f64).max(0.0)
+}
+
+/// The same beyond the error of a measured floor: a misfit for certain.
+pub(crate) fn surely_left(ctx: &Context<'_>, fit: &Fit) -> f64 {
+    let noise = fit.count as f64 * (1.0 + ctx.floor_error).powi(2);
+    (fit.chi2 - noise).max(0.0)
 }
 
 /// Sum of squares that the effects of a set with a choice of equation began from: that beside its delay and its gain, which have one

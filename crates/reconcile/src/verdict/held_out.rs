@@ -198,18 +198,20 @@ fn unconfirmed(
     if fit.parts.is_empty() {
         return Vec::new();
     }
-    let whole: Vec<f64> = splits
-        .iter()
-        .map(|(train, test)| ctx.refit(fit, train, ROUNDS).chi2_on(test))
-        .collect();
+    let predicted = |all: &Fit| -> Vec<f64> {
+        let by = |(train, _): &(Mask, Mask)| surprise(all, &ctx.refit(all, train, ROUNDS));
+        splits.iter().map(by).collect()
+    };
+    let whole = predicted(fit);
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
     let fails = cellpos_numeric::parallel::map(&indices, threads, |&i| {
         let mut parts = fit.parts.clone();
         parts.remove(i);
-        let gains = splits.iter().zip(&whole).map(|((train, test), whole)| {
-            let without = ctx.fit_from(parts.clone(), Some(fit.soft), train, ROUNDS);
-            without.chi2_on(test) - whole
-        });
+        let without = predicted(&ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), ROUNDS));
+        let gains = without
+            .iter()
+            .zip(&whole)
+            .map(|(without, whole)| without - whole);
         let (sum, least) = gains.fold((0.0, f64::INFINITY), |(s, l): (f64, f64), g| {
             (s + g, l.min(g))
         });
@@ -217,6 +219,13 @@ fn unconfirmed(
     });
     let failed = indices.into_iter().zip(fails).filter(|(_, fails)| *fails);
     failed.map(|(i, _)| i).collect()
+}
+
+/// Twice the negative logarithm of the probability of the rows that `some` was not fitted to, given those that it was: over all values that
+/// these leave possible for its numbers (Laplace's approximation). A number that the one part of a record leaves open predicts nothing of
+/// the other, and nothing against it.
+fn surprise(all: &Fit, some: &Fit) -> f64 {
+    all.chi2 - some.chi2 + all.log_information - some.log_information
 }
 
 /// Refits with a free gain beside the set (or alone) and says how far it moves from 1.

@@ -3,7 +3,7 @@
 use crate::data::frames::{self, FrameCounts};
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::search::cost::{left_over, prior_penalty};
+use crate::search::cost::{prior_penalty, surely_left};
 use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::form;
@@ -47,7 +47,7 @@ fn alternatives(
 ) -> (Vec<String>, bool) {
     let part = &fit.parts[index];
     let id = part.id();
-    let over = left_over(fit);
+    let over = surely_left(ctx, fit);
     let (mut found, mut open): (Vec<String>, bool) = (Vec::new(), false);
     for r in rivals {
         if r.id == id || found.iter().any(|a| a == r.id) {

@@ -1,7 +1,7 @@
 //! The search under the noise that goes with what it finds: a floor that a better fit lowers, a zero flow that moves.
 
 use crate::data::coloured::NoiseKind;
-use crate::data::floor::{Floor, refined};
+use crate::data::floor::{Floor, error_of, refined};
 use crate::data::noise::NoiseModel;
 use crate::data::zero_flow::Prior;
 use crate::fit::catalogue::{self, Part};
@@ -48,6 +48,7 @@ impl Searching<'_> {
             variants: catalogue::variants(self.own_effects),
             free_gain: self.free_gain,
             white: evidence(self.model, &problem.noise, trusted, problem),
+            floor_error: error_of(trusted),
             quantised: problem.quantised,
             scales: self.scales.clone(),
         }
@@ -82,10 +83,17 @@ impl Searching<'_> {
             if last {
                 return Searched { found, problem };
             }
-            // The residual of a good fit is at least as good an estimate of the noise.
+            // The residual of a good fit is at least as good an estimate of the noise. One that is larger by more than the error of the
+            // floor is a misfit.
             let (residual, _) = ctx.residual(&found.fit);
             let refined = refined(&noise, |noise| problem.unlikelihood(noise, &residual));
-            if refined.innovation_um() > 0.97 * noise.innovation_um() {
+            let changes = refined.innovation_um() / noise.innovation_um() - 1.0;
+            let error = if floor.rows > 0 {
+                error_of(floor.rows)
+            } else {
+                0.0
+            };
+            if changes.abs() < 0.03 || changes > error {
                 return Searched { found, problem };
             }
             problem = problem.with_noise(refined);

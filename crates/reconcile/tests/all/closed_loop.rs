@@ -71,8 +71,12 @@ impl Hidden {
             Self::Dahl(share, _) => ("pzt-hysteresis", vec![("fraction", share)]),
             Self::Lag(hz) => ("driver-lag", vec![("bandwidth_hz", hz)]),
             Self::Resonance(hz, d) => ("pzt-resonance", vec![("frequency_hz", hz), ("damping", d)]),
-            Self::Relaxation(..) => ("pdms-relaxation", vec![]),
-            Self::Creep(_) => ("pzt-creep", vec![]),
+            // `1 - s/(1 + T s)` is `(1 + (1 + k) T s)/(1 + T s)` over `1 + k`, where `1 - s` is `1/(1 + k)`.
+            Self::Relaxation(s, time_s) => (
+                "pdms-relaxation",
+                vec![("strength", s / (1.0 - s)), ("time_s", time_s)],
+            ),
+            Self::Creep(per_decade) => ("pzt-creep", vec![("per_decade", per_decade)]),
             Self::Adhesion(v) => ("wall-adhesion", vec![("speed_um_per_s", v)]),
             Self::DeadZone(_) => ("wall-adhesion", vec![]),
             Self::Slew(rate) => ("slew-limit", vec![("rate_um_per_s", rate)]),
