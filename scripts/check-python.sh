@@ -10,7 +10,8 @@ if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
     echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, pytest-xdist, mypy, pypylon, imageio and pyserial cannot be installed here"
     exit 0
 fi
-cargo build -q --locked -p cellpos-firmware-sim
+# The whole workspace, whose features the tests have built: one package alone has others, and is built anew.
+cargo build -q --locked --workspace --bin firmware-sim
 CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
     "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
 cd python

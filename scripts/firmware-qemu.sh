@@ -69,5 +69,5 @@ echo "firmware mps2-an386: no panic path, no double precision, no allocator"
 [ "${1:-all}" = build ] && exit 0
 
 rp2350
-cargo build --workspace --bins --locked
+cargo build --workspace --bin cellpos --bin firmware-sim --locked
 CELLPOS_FIRMWARE="$firmware" cargo test --workspace --locked --test all firmware_qemu:: -- --ignored --nocapture --test-threads 1

@@ -7,7 +7,7 @@
 // Triangular solves read as their formulas with indices, and as a riddle with iterators.
 #![allow(clippy::needless_range_loop)]
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 use std::time::Instant;
 
 /// Variables: move blocks.
@@ -156,11 +156,6 @@ impl QpMatrices {
 
     /// The variables without constraints are `-H^-1 f`; this is that matrix product for a matrix of linear terms.
     pub fn unconstrained(&self, linear: &DMatrix<f64>) -> Option<DMatrix<f64>> {
-        self.hessian.clone().cholesky().map(|c| -c.solve(linear))
-    }
-
-    /// The same for one vector.
-    pub fn unconstrained_vector(&self, linear: &DVector<f64>) -> Option<DVector<f64>> {
         self.hessian.clone().cholesky().map(|c| -c.solve(linear))
     }
 

@@ -7,7 +7,6 @@
 use nalgebra::Complex;
 
 use crate::error::IdentError;
-use cellpos_numeric::Random;
 use serde::{Deserialize, Serialize};
 
 /// The ten drive frequencies of the paper's Fig. 4 and 7, Hz.
@@ -181,143 +180,6 @@ pub fn fold(frequency_hz: f64, rate_hz: f64) -> f64 {
     wrapped.min(rate_hz - wrapped)
 }
 
-/// `count` drive lines from `low_hz` to `high_hz`, spaced evenly in the logarithm. Each is moved to the nearest
-/// multiple of `resolution_hz` whose harmonics 2..=`harmonics` miss all other lines.
-///
-/// # Errors
-/// [`IdentError::OutOfRange`] when the band is empty, reaches half the rate, or no such grid fits in it.
-pub fn drive_grid(
-    low_hz: f64,
-    high_hz: f64,
-    count: usize,
-    resolution_hz: f64,
-    rate_hz: f64,
-    harmonics: usize,
-) -> Result<Vec<f64>, IdentError> {
-    if !(low_hz > 0.0
-        && high_hz > low_hz
-        && high_hz < 0.5 * rate_hz
-        && resolution_hz > 0.0
-        && count >= 1)
-    {
-        return Err(IdentError::OutOfRange {
-            key: "high_hz",
-            value: high_hz,
-            unit: "Hz",
-            expected: "0 < low_hz < high_hz < half the sampling rate, with a positive resolution",
-        });
-    }
-    let mut lines: Vec<f64> = Vec::with_capacity(count);
-    // Place the high lines first: they fold most.
-    for i in (0..count).rev() {
-        let share = if count == 1 {
-            1.0
-        } else {
-            i as f64 / (count - 1) as f64
-        };
-        let centre = (low_hz * (high_hz / low_hz).powf(share) / resolution_hz).round() as i64;
-        let candidate = (0..4000i64)
-            .map(|n| centre + if n % 2 == 0 { n / 2 } else { -(n + 1) / 2 })
-            .filter(|&bin| bin >= 1)
-            .map(|bin| bin as f64 * resolution_hz)
-            .filter(|&f| f >= 0.999 * low_hz && f <= high_hz * 1.001)
-            .find(|&f| {
-                let mut trial = lines.clone();
-                trial.push(f);
-                let apart = lines.iter().all(|&g| (g - f).abs() > 0.5 * resolution_hz);
-                apart && check_grid(&trial, rate_hz, harmonics, 0.5 * resolution_hz).is_ok()
-            });
-        match candidate {
-            Some(f) => lines.push(f),
-            None => {
-                return Err(IdentError::OutOfRange {
-                    key: "resolution_hz",
-                    value: resolution_hz,
-                    unit: "Hz",
-                    expected: "a finer grid (a longer period): no free line is left near one of the wanted frequencies",
-                });
-            }
-        }
-    }
-    lines.sort_by(f64::total_cmp);
-    Ok(lines)
-}
-
-/// A periodic multisine: its drive lines, and the undriven lines that detect nonlinearity.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Multisine {
-    /// Driven sines with random phases.
-    pub tones: Vec<Tone>,
-    /// Odd lines left undriven: odd nonlinearity shows here.
-    pub odd_detection_hz: Vec<f64>,
-    /// Even lines near the driven ones: even nonlinearity shows here.
-    pub even_detection_hz: Vec<f64>,
-    /// Period, s.
-    pub period_s: f64,
-}
-
-/// A random-phase multisine of period `period_s` on odd lines from `low_hz` to `high_hz`. In each group of `group` odd
-/// lines, one drawn at random is not driven. `amplitude_um(f)` shapes the spectrum.
-///
-/// # Errors
-/// [`IdentError::OutOfRange`] when fewer than four odd lines fit in the band.
-pub fn odd_multisine(
-    low_hz: f64,
-    high_hz: f64,
-    period_s: f64,
-    group: usize,
-    amplitude_um: impl Fn(f64) -> f64,
-    seed: u64,
-) -> Result<Multisine, IdentError> {
-    let mut random = Random::new(seed);
-    let odd: Vec<usize> = (1usize..)
-        .step_by(2)
-        .skip_while(|&k| (k as f64) < low_hz * period_s * (1.0 - 1e-12))
-        .take_while(|&k| k as f64 <= high_hz * period_s * (1.0 + 1e-12))
-        .collect();
-    if odd.len() < 4 {
-        return Err(IdentError::OutOfRange {
-            key: "period_s",
-            value: period_s,
-            unit: "s",
-            expected: "a period long enough for four odd lines in the band",
-        });
-    }
-    let group = group.max(2);
-    let mut tones = Vec::new();
-    let mut odd_detection_hz = Vec::new();
-    for lines in odd.chunks(group) {
-        let silent = if lines.len() == group {
-            random.below(group)
-        } else {
-            usize::MAX
-        };
-        for (i, &k) in lines.iter().enumerate() {
-            let frequency_hz = k as f64 / period_s;
-            if i == silent {
-                odd_detection_hz.push(frequency_hz);
-            } else {
-                let phase_rad = 2.0 * std::f64::consts::PI * random.uniform();
-                tones.push(Tone {
-                    frequency_hz,
-                    amplitude_um: amplitude_um(frequency_hz),
-                    phase_rad,
-                });
-            }
-        }
-    }
-    let even_detection_hz = odd
-        .chunks(group)
-        .map(|lines| (lines[0] + 1) as f64 / period_s)
-        .collect();
-    Ok(Multisine {
-        tones,
-        odd_detection_hz,
-        even_detection_hz,
-        period_s,
-    })
-}
-
 /// Limits that an excitation must respect.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExcitationLimits {
@@ -354,15 +216,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_papers_grid_aliases_onto_itself_and_the_drive_grid_does_not() {
+    fn the_papers_grid_aliases_onto_itself() {
         let clash = check_grid(&PAPER_FREQUENCIES_HZ, 1000.0, 5, 0.25).unwrap_err();
         assert!(matches!(clash, IdentError::AliasOnGrid { .. }), "{clash}");
         let high = check_grid(&[100.0, 200.0, 300.0], 1000.0, 7, 0.25).unwrap_err();
         assert!(matches!(high, IdentError::AliasOnGrid { .. }));
-        let grid = drive_grid(2.0, 300.0, 12, 0.5, 1000.0, 7).unwrap();
-        assert_eq!(grid.len(), 12);
-        assert_eq!(check_grid(&grid, 1000.0, 7, 0.25), Ok(()));
-        assert!(grid.windows(2).all(|w| w[0] < w[1]));
+        assert_eq!(check_grid(&[7.0, 61.0, 211.0], 1000.0, 3, 0.25), Ok(()));
     }
 
     #[test]
@@ -370,30 +229,6 @@ mod tests {
         assert_eq!(fold(900.0, 1000.0), 100.0);
         assert_eq!(fold(1200.0, 1000.0), 200.0);
         assert_eq!(fold(293.0, 1000.0), 293.0);
-    }
-
-    #[test]
-    fn a_multisine_drives_odd_lines_only_and_its_detection_lines_are_silent() {
-        let m = odd_multisine(2.0, 60.0, 1.0, 4, |_| 0.5, 11).unwrap();
-        assert!(m.tones.iter().all(|t| (t.frequency_hz as usize) % 2 == 1));
-        let signal = Signal::Tones {
-            tones: m.tones.clone(),
-            fade_in_s: 0.0,
-        };
-        let samples: Vec<f64> = (0..1000)
-            .map(|k| signal.value_um(k as f64 * 1e-3))
-            .collect();
-        for f in m.odd_detection_hz.iter().chain(&m.even_detection_hz) {
-            let sum: Complex<f64> = samples
-                .iter()
-                .enumerate()
-                .map(|(k, x)| {
-                    Complex::from_polar(*x, -2.0 * std::f64::consts::PI * f * k as f64 * 1e-3)
-                })
-                .sum();
-            assert!(sum.norm() < 1e-8, "{f} Hz");
-        }
-        assert!(m.odd_detection_hz.len() >= 6);
     }
 
     #[test]

@@ -45,13 +45,6 @@ pub struct DiscreteState {
     past: Vec<f64>,
 }
 
-impl DiscreteState {
-    /// The last commands, newest first \[um\].
-    pub fn past_commands_um(&self) -> &[f64] {
-        &self.past
-    }
-}
-
 impl DiscretePlant {
     /// Discretises a plant exactly for a command held over `sample`, delayed by `delay`.
     ///

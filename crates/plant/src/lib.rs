@@ -1,7 +1,7 @@
 //! The plant of Mizoue et al. 2017 (doi 10.3390/mi8030080), Eq. (1)-(7), its discretisation, effect blocks and model
 //! files.
 //!
-//! - [`TransferFunction`] with Eq. (6) built in, [`PhysicalParameters`] for Eq. (1)-(4), [`StateSpace`] for analysis.
+//! - [`TransferFunction`] with Eq. (6) built in, [`StateSpace`] for analysis.
 //! - [`DiscretePlant`]: exact zero-order hold with any delay, for controllers and estimators.
 //! - [`Model`]: plant, [`Effect`]s and [`Noise`]; all commands share it. On disk it is `model.toml`.
 //! - [`Chain`]: a model as a time-stepping machine from the command to the true bead position; [`Simulator`] adds the
@@ -34,7 +34,6 @@ mod modal;
 mod model;
 mod model_file;
 mod phi;
-mod physical;
 pub mod quantities;
 mod roots;
 mod simulate;
@@ -51,7 +50,6 @@ pub use frames::{FrameFate, apply_frame_fates, frame_fates};
 pub use modal::Zpk;
 pub use model::{Covariance, Model, Noise};
 pub use nalgebra::Complex;
-pub use physical::{NotIdentifiable, PhysicalParameters, SecondOrder};
 pub use simulate::{Sampled, SimulateError, SimulateOptions, Simulator, simulate, simulate_at};
 pub use state_space::StateSpace;
 pub use transfer::{

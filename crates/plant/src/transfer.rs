@@ -177,30 +177,6 @@ impl TransferFunction {
     pub fn velocity_gain_at(&self, frequency: Hertz) -> f64 {
         TAU * frequency.value() * self.response(frequency).norm()
     }
-
-    /// The velocity gain K \[1/s\] below the nearly cancelling pole-zero pair: 428/s for Eq. (6).
-    ///
-    /// Defined for plants that are an integrator (or have a pole near zero) with at most one pair: first and second
-    /// order. `None` for others: use [`Self::velocity_gain_at`].
-    pub fn velocity_gain_below_pair(&self) -> Option<f64> {
-        match (self.num.as_slice(), self.den.as_slice()) {
-            ([.., b0], [a1, _]) if *a1 != 0.0 => Some(b0 / a1),
-            ([.., b0], [_, a1, _]) if *a1 != 0.0 => Some(b0 / a1),
-            _ => None,
-        }
-    }
-
-    /// The velocity gain K \[1/s\] above the pole-zero pair and below the far zero: 379/s for Eq. (6).
-    ///
-    /// `None` where [`Self::velocity_gain_below_pair`] is, and for a second-order plant without a zero, which has no
-    /// pair.
-    pub fn velocity_gain_above_pair(&self) -> Option<f64> {
-        match (self.num.as_slice(), self.den.as_slice()) {
-            ([.., b0], [a1, _]) => Some(b0 / a1),
-            ([.., b1, _], [a2, _, _]) => Some(b1 / a2),
-            _ => None,
-        }
-    }
 }
 
 fn trimmed(which: &'static str, coefficients: Vec<f64>) -> Result<Vec<f64>, PlantError> {

@@ -297,12 +297,6 @@ impl<R: ReferenceGenerator> Core<R> {
         &self.timing
     }
 
-    /// Time since the loop was closed, s; `None` when it is not.
-    pub fn running_for_s(&self) -> Option<f64> {
-        (self.state.life == Life::Running)
-            .then(|| (self.state.index - self.state.running_since) as f64 * self.sample_s)
-    }
-
     /// Sequence number of the next tick.
     pub(crate) fn next_seq(&self) -> u64 {
         self.state.seq

@@ -207,11 +207,6 @@ impl<R: ReferenceGenerator> Ticker<R> {
         self.slow_vision_ns = ns;
     }
 
-    /// Whether the camera's end of the ring is gone.
-    pub fn camera_is_gone(&self) -> bool {
-        self.measurements.is_abandoned()
-    }
-
     /// Whether the recorder no longer keeps up: half of its ring is full, or nobody is at its other end.
     pub fn recorder_is_behind(&self) -> bool {
         self.records.is_abandoned() || self.records.slots() < self.records.buffer().capacity() / 2

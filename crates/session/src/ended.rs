@@ -97,18 +97,24 @@ impl Ended {
         let advice = [self.to_do.as_str(), help];
         let advice = advice.iter().filter(|part| !part.is_empty());
         let help = advice.copied().collect::<Vec<_>>().join("; ");
-        let (seen, to_do) = (self.clone(), String::new());
-        Failure::Failed(miette::miette!(help = help, "{}", Self { to_do, ..seen }))
+        Failure::Failed(miette::miette!(help = help, "{}", self.seen_and_expected()))
+    }
+
+    fn seen_and_expected(&self) -> String {
+        let expected = if self.expected.is_empty() {
+            String::new()
+        } else {
+            format!("; expected {}", self.expected)
+        };
+        format!("{}{expected}", self.seen)
     }
 }
 
 impl fmt::Display for Ended {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.seen)?;
-        for (before, part) in [("; expected ", &self.expected), ("; ", &self.to_do)] {
-            if !part.is_empty() {
-                write!(f, "{before}{part}")?;
-            }
+        f.write_str(&self.seen_and_expected())?;
+        if !self.to_do.is_empty() {
+            write!(f, "; {}", self.to_do)?;
         }
         Ok(())
     }

@@ -7,6 +7,7 @@ mod effects_page;
 mod hidden_effects;
 mod noise;
 mod paper;
+mod physical;
 
 /// Counts by thread, so that parallel tests do not disturb one another.
 #[global_allocator]

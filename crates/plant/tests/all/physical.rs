@@ -3,50 +3,47 @@
 //! Tests check Eq. (4) against a numeric solution of (1)-(3). (A9) and (A10) are corrected here: the printed (A10) has
 //! `(2 z^2 w)^2` instead of `(2 z w)^2`, an error of 24.8 dB at 10 Hz.
 
-use crate::error::PlantError;
-use crate::transfer::TransferFunction;
-use cellpos_numeric::units::Hertz;
-use nalgebra::Complex;
+use cellpos_plant::{Complex, Hertz, PlantError, TransferFunction};
 use std::f64::consts::TAU;
 
 /// The parameters of Eq. (1)-(3), in SI units.
 ///
 /// (1) `A1 x1 = Ac xc + A2 x2`, (2) `p Ac = M xc'' + c xc' + k xc`, (3) `p A2 = m x2'' + c2 x2' + k2 x2`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PhysicalParameters {
+pub(crate) struct PhysicalParameters {
     /// A1, cross-section of the syringe that the PZT pushes, m^2.
-    pub a1_m2: f64,
+    pub(crate) a1_m2: f64,
     /// A2, cross-section of the microchannel, m^2.
-    pub a2_m2: f64,
+    pub(crate) a2_m2: f64,
     /// Ac, cross-section of the virtual piston that represents the compliant walls, m^2.
-    pub ac_m2: f64,
+    pub(crate) ac_m2: f64,
     /// M, mass of the virtual piston, kg.
-    pub wall_mass_kg: f64,
+    pub(crate) wall_mass_kg: f64,
     /// c, its damping, N s/m.
-    pub wall_damping_n_s_per_m: f64,
+    pub(crate) wall_damping_n_s_per_m: f64,
     /// k, its stiffness, N/m.
-    pub wall_stiffness_n_per_m: f64,
+    pub(crate) wall_stiffness_n_per_m: f64,
     /// m, mass of the fluid in the channel, kg.
-    pub fluid_mass_kg: f64,
+    pub(crate) fluid_mass_kg: f64,
     /// c2, viscous resistance of the channel, N s/m.
-    pub channel_damping_n_s_per_m: f64,
+    pub(crate) channel_damping_n_s_per_m: f64,
     /// k2, stiffness at the channel's outlet, N/m.
-    pub outlet_stiffness_n_per_m: f64,
+    pub(crate) outlet_stiffness_n_per_m: f64,
 }
 
 /// The coefficients of Eq. (4): `alpha (s^2 + 2 z1 w1 s + w1^2) / (s^2 + 2 z2 w2 s + w2^2)`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SecondOrder {
+pub(crate) struct SecondOrder {
     /// alpha, um/um.
-    pub alpha: f64,
+    pub(crate) alpha: f64,
     /// zeta 1, damping ratio of the zeros.
-    pub zeta1: f64,
+    pub(crate) zeta1: f64,
     /// omega 1, rad/s.
-    pub omega1_rad_per_s: f64,
+    pub(crate) omega1_rad_per_s: f64,
     /// zeta 2, damping ratio of the poles.
-    pub zeta2: f64,
+    pub(crate) zeta2: f64,
     /// omega 2, rad/s.
-    pub omega2_rad_per_s: f64,
+    pub(crate) omega2_rad_per_s: f64,
 }
 
 /// Why the five coefficients of Eq. (4) do not determine the nine parameters of Eq. (1)-(3).
@@ -55,7 +52,7 @@ pub struct SecondOrder {
 /// all forces (M, c, k, m, c2, k2), a change of Ac with m, c2, k2 that keeps `(Ac/A2)^2 (m, c2, k2)`, and a common
 /// factor on A1 and A2.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum NotIdentifiable {
+pub(crate) enum NotIdentifiable {
     /// The gain alpha is larger than the geometry allows: the fluid's mass would have to be negative.
     #[error(
         "alpha = {alpha} is larger than A1/A2 = {area_ratio}: by Eq. (A6) the fluid's mass would be negative; check the two cross-sections"
@@ -93,12 +90,12 @@ pub enum NotIdentifiable {
 
 impl PhysicalParameters {
     /// `r = (Ac/A2)^2`.
-    pub fn area_ratio_squared(&self) -> f64 {
+    pub(crate) fn area_ratio_squared(&self) -> f64 {
         (self.ac_m2 / self.a2_m2).powi(2)
     }
 
     /// Eq. (4): the coefficients that follow from (1)-(3).
-    pub fn second_order(&self) -> SecondOrder {
+    pub(crate) fn second_order(&self) -> SecondOrder {
         let r = self.area_ratio_squared();
         let (mass, stiffness) = (
             self.wall_mass_kg + r * self.fluid_mass_kg,
@@ -119,7 +116,7 @@ impl PhysicalParameters {
     ///
     /// # Errors
     /// Parameters that make no plant, for example a wall without mass, damping and stiffness.
-    pub fn transfer_function(&self) -> Result<TransferFunction, PlantError> {
+    pub(crate) fn transfer_function(&self) -> Result<TransferFunction, PlantError> {
         let r = self.area_ratio_squared();
         let gain = self.a1_m2 / self.a2_m2;
         TransferFunction::new(
@@ -137,21 +134,21 @@ impl PhysicalParameters {
     }
 
     /// Eq. (A5): the gain towards zero frequency, `(A1/A2) k / (k + r k2)`.
-    pub fn low_frequency_limit(&self) -> f64 {
+    pub(crate) fn low_frequency_limit(&self) -> f64 {
         let r = self.area_ratio_squared();
         self.a1_m2 / self.a2_m2 * self.wall_stiffness_n_per_m
             / (self.wall_stiffness_n_per_m + r * self.outlet_stiffness_n_per_m)
     }
 
     /// Eq. (A6): the gain towards infinite frequency, `(A1/A2) M / (M + r m)`.
-    pub fn high_frequency_limit(&self) -> f64 {
+    pub(crate) fn high_frequency_limit(&self) -> f64 {
         let r = self.area_ratio_squared();
         self.a1_m2 / self.a2_m2 * self.wall_mass_kg / (self.wall_mass_kg + r * self.fluid_mass_kg)
     }
 
     /// A numeric solution of Eq. (1)-(3) at a frequency: X2/X1 from the three linear equations in Xc, X2 and p,
     /// without Eq. (4). `None` if they are singular.
-    pub fn solve(&self, frequency: Hertz) -> Option<Complex<f64>> {
+    pub(crate) fn solve(&self, frequency: Hertz) -> Option<Complex<f64>> {
         let s = Complex::new(0.0, TAU * frequency.value());
         let wall = s * s * self.wall_mass_kg
             + s * self.wall_damping_n_s_per_m
@@ -188,7 +185,7 @@ impl PhysicalParameters {
     ///
     /// # Errors
     /// Areas or a mass that are not positive, and coefficients that no passive rig of this geometry has.
-    pub fn from_second_order(
+    pub(crate) fn from_second_order(
         coefficients: &SecondOrder,
         a1_m2: f64,
         a2_m2: f64,
@@ -259,7 +256,7 @@ impl PhysicalParameters {
 impl SecondOrder {
     /// The coefficients that the paper lists with Eq. (6). They are rounded: `2 z1 w1` is 20343 (20261.5 in Eq. (6)),
     /// `2 z2 w2` is 75.46 (76.3 in Eq. (6)). Use [`TransferFunction::eq6`].
-    pub const PAPER_ROUNDED: Self = Self {
+    pub(crate) const PAPER_ROUNDED: Self = Self {
         alpha: 0.01872,
         zeta1: 7.7,
         omega1_rad_per_s: 1321.0,
@@ -269,7 +266,7 @@ impl SecondOrder {
 
     /// The coefficients of a second-order biproper transfer function; `None` for another shape, or if `w1` or `w2` is
     /// not real and positive.
-    pub fn from_transfer_function(g: &TransferFunction) -> Option<Self> {
+    pub(crate) fn from_transfer_function(g: &TransferFunction) -> Option<Self> {
         let ([b2, b1, b0], [a2, a1, a0]) = (g.num(), g.den()) else {
             return None;
         };
@@ -290,7 +287,7 @@ impl SecondOrder {
     ///
     /// # Errors
     /// Coefficients that are not finite, or alpha zero.
-    pub fn transfer_function(&self) -> Result<TransferFunction, PlantError> {
+    pub(crate) fn transfer_function(&self) -> Result<TransferFunction, PlantError> {
         let (w1, w2) = (self.omega1_rad_per_s, self.omega2_rad_per_s);
         TransferFunction::new(
             vec![
@@ -303,7 +300,7 @@ impl SecondOrder {
     }
 
     /// Eq. (A10), corrected: `|G|` at a frequency, with `(2 z w)^2` in the middle terms.
-    pub fn gain(&self, frequency: Hertz) -> f64 {
+    pub(crate) fn gain(&self, frequency: Hertz) -> f64 {
         let w2 = (TAU * frequency.value()).powi(2);
         let term = |zeta: f64, omega: f64| {
             w2 * w2 + ((2.0 * zeta * omega).powi(2) - 2.0 * omega * omega) * w2 + omega.powi(4)
