@@ -303,3 +303,34 @@ pub(crate) fn bands(
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::verdict::map::{Cell, MapRow};
+
+    /// White noise of one unit at 200 Hz: the parts of its bands add up to the whole.
+    #[test]
+    fn bands_end_at_half_the_rate_and_add_up() {
+        let cell = Cell {
+            rms_um: 1.0,
+            floor_um: 1.0,
+            z: 0.0,
+            flagged: false,
+        };
+        let row = MapRow {
+            name: "a".to_owned(),
+            cells: vec![cell; BAND_EDGES_HZ.len()],
+        };
+        let map = DiscrepancyMap {
+            rows: vec![row],
+            ratios: Vec::new(),
+        };
+        let found = bands(&map, &map, 100.0);
+        assert_eq!(found.last().map(|band| band.high_hz), Some(100.0));
+        let whole: f64 = (found.iter())
+            .map(|band| band.before.powi(2) * (band.high_hz - band.low_hz) / 100.0)
+            .sum();
+        assert!((whole - 1.0).abs() < 1e-12, "{whole}");
+    }
+}
