@@ -90,7 +90,8 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
         parts.push(format!("delay {way} by {:.2} ms", more_ms.abs()));
     }
     let hint = match (gain_changed, ratio < 1.0) {
-        (true, true) if more_ms > 1e-6 => "; is there gas in the line?",
+        // Gas answers later as well, which may have been reported before.
+        (true, true) if delay_ms[1] > 1e-6 => "; is there gas in the line?",
         (true, true) => "; is the channel clogging?",
         (true, false) => "; has a constriction opened, or the bead moved to the middle?",
         (false, _) => "; does the camera or the amplifier take longer than the rig file says?",
@@ -110,11 +111,15 @@ mod tests {
     use super::*;
 
     fn told(gain: [f64; 2], delay_ms: f64, over_s: f64) -> String {
+        told_from(gain, [0.0, delay_ms], over_s)
+    }
+
+    fn told_from(gain: [f64; 2], delay_ms: [f64; 2], over_s: f64) -> String {
         sentence(&EventKind::Adapted {
             gain_before: gain[0],
             gain: gain[1],
-            delay_before_ms: 0.0,
-            delay_ms,
+            delay_before_ms: delay_ms[0],
+            delay_ms: delay_ms[1],
             over_s,
         })
     }
@@ -143,6 +148,11 @@ mod tests {
         assert_eq!(
             told([1.0, 0.7], 0.5, 8.0),
             "Gain fell to 0.70, delay grew by 0.50 ms over 8.0 s: adapted; is there gas in the line?"
+        );
+        // The delay was reported before the gain.
+        assert_eq!(
+            told_from([1.0, 0.7], [0.5, 0.5], 9.0),
+            "Gain fell to 0.70 over 9.0 s: adapted; is there gas in the line?"
         );
         assert_eq!(
             told([1.0, 1.04], 1.0, 0.5),

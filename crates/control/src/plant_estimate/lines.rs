@@ -16,9 +16,9 @@ use std::f64::consts::{LN_2, TAU};
 
 /// Lines at once: a pump with five harmonics, the mains, and one more.
 const MOST: usize = 8;
-/// Sampling interval of the spectrum, s (a slower camera has its own), and the highest frequency, Hz: two fifths of that rate.
-const SAMPLE_S: f64 = 1e-3;
+/// Highest frequency, Hz, and sampling interval of the spectrum, s (a slower camera has its own): two fifths of Nyquist's frequency.
 const HIGHEST_HZ: f64 = 200.0;
+const SAMPLE_S: f64 = 0.2 / HIGHEST_HZ;
 /// Samples of a spectrum, 2 s: resolves lines that are 1 Hz apart under Hann's window (main lobe of 4 bins).
 const WINDOW: usize = 2048;
 /// Samples that are kept: a window, and those that come while it is analysed.
