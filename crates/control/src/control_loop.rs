@@ -8,7 +8,7 @@ use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 use crate::path::{Path, PathState};
-use crate::plant_estimate::{AdaptState, Adaptation, Adapter, TickOutcome};
+use crate::plant_estimate::{AdaptState, Adaptation, Adapter, INTERVAL, TickOutcome};
 use crate::tuning::Tuning;
 
 /// State of a loop whose law has the state `S`.
@@ -28,6 +28,8 @@ pub struct LoopState<S> {
     pub path: PathState,
     /// Estimate of the plant and the tuning in force, where the loop adapts.
     pub adapt: Option<AdaptState>,
+    /// Gain over the model's that the feed-forward is divided by, where the loop does not adapt and it was measured before.
+    pub measured_gain: Option<f64>,
 }
 
 /// Estimator, control law and limits. Immutable; the state is apart.
@@ -112,6 +114,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             forward_um: 0.0,
             path: PathState::default(),
             adapt: self.adapter.map(|adapter| adapter.start(command)),
+            measured_gain: None,
         }
     }
 
@@ -122,11 +125,13 @@ impl<L: ControlLaw> ControlLoop<L> {
     }
 
     /// The gain over the model's was measured before the loop is closed, with this standard deviation: the estimate of the plant begins
-    /// there. A loop that does not adapt does without.
+    /// there. The feed-forward of a loop that does not adapt is divided by the gain within the 95 % interval that is nearest to the model's.
     pub fn start_estimate(&self, state: &mut LoopState<L::State>, gain: f64, sd: f64) {
         let measured = gain.is_finite() && sd.is_finite() && sd > 0.0;
-        if let Some(adapt) = state.adapt.as_mut().filter(|_| measured) {
-            adapt.tell(gain, sd);
+        let (low, high) = (gain - INTERVAL * sd, gain + INTERVAL * sd);
+        match state.adapt.as_mut().filter(|_| measured) {
+            Some(adapt) => adapt.tell(gain, sd),
+            None => state.measured_gain = (measured && low > 0.0).then(|| 1.0_f64.clamp(low, high)),
         }
     }
 
@@ -224,7 +229,7 @@ impl<L: ControlLaw> ControlLoop<L> {
                 Mode::Run | Mode::Freeze => tick.law.estimate.neutral_um,
             })
         };
-        let driven = driven(input, &tick);
+        let driven = driven(input, &tick, state.measured_gain);
         // What the law asks for on its own.
         let own_um = decided.wish_um;
         decided.wish_um += driven.feed_forward_um;
@@ -470,13 +475,14 @@ impl<L: ControlLaw> ControlLoop<L> {
 }
 
 /// What moves the bead along the reference in a tick.
-fn driven(input: &LoopInput, tick: &Tick) -> Driven {
+fn driven(input: &LoopInput, tick: &Tick, measured_gain: Option<f64>) -> Driven {
     let gain = tick.law.tuning.gain;
     let asked = input.feed_forward_gain;
     Driven {
         feed_forward_um: tick.law.feed_forward_um,
         jump_um: 0.0,
         feed_forward_gain: asked
+            .or(measured_gain)
             .filter(|gain| (0.1..=10.0).contains(gain))
             .unwrap_or(gain),
         gain,

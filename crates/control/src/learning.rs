@@ -417,7 +417,7 @@ impl Learner {
         }
         if !evidence.is_limited() {
             state.feed_forward_gain = if learning {
-                state.feed_forward_gain.or(Some(driven.gain))
+                state.feed_forward_gain.or(Some(driven.feed_forward_gain))
             } else {
                 None
             };

@@ -71,12 +71,6 @@ impl GainCheck {
             sure: refusal != Some(Refusal::Disturbed),
         }
     }
-
-    /// Gain over the model's, within the 95 % interval, that is nearest to the model's; `None` if none was measured.
-    pub(crate) fn nearest_gain(&self) -> Option<f64> {
-        let (low, high) = (self.gain_ratio - self.ci95, self.gain_ratio + self.ci95);
-        (low > 0.0 && high.is_finite()).then(|| 1.0_f64.clamp(low, high))
-    }
 }
 
 /// The doublet and its response according to the model, both computed before the run.

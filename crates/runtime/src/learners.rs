@@ -10,18 +10,12 @@ pub struct Learners {
     all: Vec<Option<CycleLearning>>,
     /// The motion of the last tick.
     motion: u16,
-    /// Gain over the model's that the check before the run found, for a law that does not follow the gain.
-    armed_gain: Option<f64>,
 }
 
 impl Learners {
     /// One learner for each motion by its number ([`crate::ReferenceOutput::motion`]).
     pub fn new(all: Vec<Option<CycleLearning>>) -> Self {
-        Self {
-            all,
-            motion: 0,
-            armed_gain: None,
-        }
+        Self { all, motion: 0 }
     }
 
     /// The addition that each learner has learned.
@@ -62,15 +56,8 @@ impl Learners {
     /// Gain that the feed-forward is to be divided by in this tick; see [`CycleLearning::feed_forward_gain`].
     pub(crate) fn feed_forward_gain(&self) -> Option<f64> {
         // An addition is right together with the gain at which it was learned.
-        match self.all.get(usize::from(self.motion)) {
-            Some(Some(learning)) => learning.feed_forward_gain(),
-            _ => self.armed_gain,
-        }
-    }
-
-    /// The check before the run found this gain over the model's.
-    pub(crate) fn set_armed_gain(&mut self, gain: Option<f64>) {
-        self.armed_gain = gain;
+        let learning = self.all.get(usize::from(self.motion))?.as_ref()?;
+        learning.feed_forward_gain()
     }
 
     /// After the controller's step: learns from the fix that was used, by what moved the bead.

@@ -7,6 +7,7 @@ pub(crate) mod trial;
 
 use crate::common::{config, first_seed, mpc};
 use cellpos_control::*;
+use cellpos_plant::TransferFunction;
 use trial::{Regime, hold_through, regimes};
 
 fn adapting(controller: ControllerConfig) -> LoopConfig {
@@ -370,4 +371,75 @@ fn the_estimate_begins_with_the_gain_that_arming_measured() {
     });
     let now = controller.adaptation().unwrap();
     assert!((now.gain - 1.0).abs() < 0.2, "{now:?}");
+}
+
+/// A loop that does not adapt: the feed-forward is divided by what was measured, as far as that surely differs from the model's.
+#[test]
+fn without_adaptation_the_feed_forward_is_divided_by_the_gain_that_arming_measured() {
+    let pi = ControllerConfig::Pi(Pi::new(0.46, 19.5));
+    for (gain, sd, divided_by) in [
+        (2.0, 0.1, 1.804),
+        (0.5, 0.02, 0.5392),
+        (1.05, 0.03, 1.0),
+        (0.5, 0.3, 1.0),
+        (f64::NAN, f64::NAN, 1.0),
+    ] {
+        let mut controller = Controller::new(config(pi)).unwrap();
+        controller.start(20.0, 20.0);
+        controller.start_estimate(gain, sd);
+        let mut rig = SimulatedRig::new(RigConfig::eq6(0)).unwrap();
+        let driven = tick(&mut controller, &mut rig).driven;
+        let off = driven.feed_forward_gain - divided_by;
+        assert!(off.abs() < 1e-9 && driven.gain == 1.0, "{gain}: {driven:?}");
+    }
+}
+
+/// What a run would tell: gain and delay before and after each change that is reported.
+fn told(rig: &mut SimulatedRig, seconds: u32, gain: impl Fn(f64) -> f64) -> Vec<AdaptNews> {
+    let mut controller = Controller::new(adapting(lqg())).unwrap();
+    controller.start(20.0, 20.0);
+    let mut news = Vec::new();
+    for k in 0..1000 * seconds {
+        rig.gain = gain(1e-3 * f64::from(k));
+        tick(&mut controller, rig);
+        news.extend(controller.adaptation().unwrap().news);
+    }
+    news
+}
+
+/// A rig with a lag that its model does not have.
+fn behind(seed: u64, lag_s: f64) -> SimulatedRig {
+    let lag = TransferFunction::new(vec![1.0], vec![lag_s, 1.0]).unwrap();
+    let eq6 = RigConfig::eq6(seed);
+    let plant = eq6.plant.series(&lag).unwrap();
+    SimulatedRig::new(RigConfig { plant, ..eq6 }).unwrap()
+}
+
+/// A gas bubble in the chip is a lag: the bead moves less in a tick, and later. The delay may be reported before the gain, never after it.
+#[test]
+fn gas_is_less_gain_with_more_delay_and_a_clog_is_less_gain_alone() {
+    for seed in 0..4 {
+        for lag_s in [1e-3, 2e-3] {
+            let news = told(&mut behind(seed, lag_s), 30, |_| 1.0);
+            let late = news.iter().all(|one| one.delay_samples[1] > 0.0);
+            let fell = news.last().is_some_and(|one| one.gain[1] < 0.75);
+            // A bubble of 1 ms is less gain by a third at most, which need not be known after 30 s.
+            assert!(late && !news.is_empty(), "seed {seed}, {lag_s} s: {news:?}");
+            assert!(fell || lag_s < 2e-3, "seed {seed}, {lag_s} s: {news:?}");
+        }
+        // A larger one is beyond what the law can be tuned to. No other delay is told of.
+        for lag_s in [4e-3, 8e-3] {
+            let news = told(&mut behind(seed, lag_s), 30, |_| 1.0);
+            let late = news.iter().all(|one| one.delay_samples[1] >= 0.0);
+            assert!(late, "seed {seed}, {lag_s} s: {news:?}");
+        }
+        let mut rig = SimulatedRig::new(RigConfig::eq6(seed)).unwrap();
+        let clogs = |t: f64| 0.5_f64.powf(((t - 20.0) / 60.0).clamp(0.0, 1.0));
+        let news = told(&mut rig, 90, clogs);
+        let alone = |one: &AdaptNews| one.gain[1] < one.gain[0] && one.delay_samples == [0.0; 2];
+        assert!(
+            !news.is_empty() && news.iter().all(alone),
+            "seed {seed}: {news:?}"
+        );
+    }
 }

@@ -100,9 +100,6 @@ impl<R: ReferenceGenerator> Core<R> {
                         self.latch(SafeReason::ArmingRefused, tick);
                     }
                     None => {
-                        if self.controller.adaptation().is_none() {
-                            self.learners.set_armed_gain(verdict.nearest_gain());
-                        }
                         self.controller
                             .start_estimate(verdict.gain_ratio, verdict.ci95 / 1.96);
                         if verdict.gain_ratio.is_finite() {
