@@ -19,6 +19,9 @@ const STILL: f64 = 0.5;
 const ENOUGH: f64 = 0.26;
 /// Standard deviations by which the motion of the loop's own commands asks for caution.
 const CAUTION: f64 = 6.0;
+/// Mean square of the residual, over the usual one, that ringing at least leaves: ten standard deviations of a mean of [`NOW_FIXES`]
+/// squares would be 2.3. Without it a quiet hold asks for caution once in a hundred hours.
+const LOUD: f64 = 2.5;
 
 /// The residual now, and its correlation with the motion of the loop's own commands.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -42,7 +45,8 @@ impl Now {
     /// How far the logarithm of the gain in force should rise, where the residual usually has this mean square.
     fn rise(&self, gain: f64, usual_um2: f64) -> f64 {
         let wrong = self.py - gain * self.pp;
-        if wrong > CAUTION * (self.pp * usual_um2).sqrt() {
+        let surely = wrong > CAUTION * (self.pp * usual_um2).sqrt();
+        if surely && self.left(gain) > LOUD * usual_um2 * self.fixes {
             (wrong / (gain * self.pp)).ln_1p()
         } else {
             0.0
@@ -51,8 +55,12 @@ impl Now {
 
     /// Whether the bead wanders less than with this mean square, or too few fixes tell.
     fn still(&self, gain: f64, usual_um2: f64) -> bool {
-        let left = self.yy - 2.0 * gain * self.py + gain * gain * self.pp;
-        self.fixes < STILL * NOW_FIXES || left < STILL * usual_um2 * self.fixes
+        self.fixes < STILL * NOW_FIXES || self.left(gain) < STILL * usual_um2 * self.fixes
+    }
+
+    /// Sum of the squares that a gain leaves, um^2.
+    fn left(&self, gain: f64) -> f64 {
+        self.yy - 2.0 * gain * self.py + gain * gain * self.pp
     }
 }
 
