@@ -143,11 +143,12 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
         return of_few_cycles(rows, &rest);
     };
     let mut text = format!(
-        "The cell's stretch (largest length over the {:.2} um at rest) went {}{} over {} cycles (means of the first and the last {})",
+        "The cell's stretch (largest length over the {:.2} um at rest) went {}{} over {} cycles{} (means of the first and the last {})",
         rest.length_um,
         change(&stretch),
         percent(&stretch),
         stretch.cycles,
+        disturbed(rows.iter().filter(super::fatigue::is_whole)),
         stretch.first.cycles
     );
     if let Some(recovery) = cyclic(rows, |row| row.recovery_s) {
@@ -199,9 +200,10 @@ fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<Said> {
     let (first, last) = (stretches.first()?, stretches.last()?);
     Some(Said {
         result: format!(
-            "The cell's stretch (largest length over the {:.2} um at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles.",
+            "The cell's stretch (largest length over the {:.2} um at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles{}.",
             rest.length_um,
-            stretches.len()
+            stretches.len(),
+            disturbed(rows.iter().filter(super::fatigue::is_whole))
         ),
         sure: "so few cycles have no interval.".to_string(),
     })
@@ -275,14 +277,18 @@ fn of_waves(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said
     })
 }
 
+/// How many of these cycles were disturbed: frames or the object were missing, so their lengths and errors may be wrong.
+fn disturbed<'a>(rows: impl Iterator<Item = &'a CycleRow>) -> String {
+    match rows.filter(|row| row.flags.is_disturbed()).count() {
+        0 => String::new(),
+        n => format!(", {n} of them disturbed"),
+    }
+}
+
 /// A bead over the cycles of a script. Its steps count, which the error of a hold leaves out.
 fn of_cycles(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said> {
     let error = over_cycles(rows)?;
-    let disturbed = rows.iter().filter(|row| row.flags.is_disturbed()).count();
-    let but = match disturbed {
-        0 => String::new(),
-        n => format!(", {n} of them disturbed"),
-    };
+    let but = disturbed(rows.iter());
     let cycles = if rows.len() == 1 { "cycle" } else { "cycles" };
     Some(Said {
         result: format!(
@@ -387,5 +393,23 @@ mod tests {
             "{text}"
         );
         assert!(of_a_cell(&[]).is_none());
+    }
+
+    #[test]
+    fn a_cell_whose_cycles_were_disturbed_says_so_first() {
+        for cycles in [4, 40] {
+            let rows: Vec<CycleRow> = (0..cycles)
+                .map(|cycle| {
+                    let mut row = CycleRow::empty(cycle, 1, ArmKind::Cyclic);
+                    (row.start_s, row.duration_s) = (cycle as f64, 1.0);
+                    (row.length_start_um, row.length_peak_um) = (5.0, 18.0);
+                    row.flags = CycleFlags(CycleFlags::DISTURBED);
+                    row
+                })
+                .collect();
+            let text = of_a_cell(&rows).unwrap().result;
+            let says = format!("{cycles} cycles, {cycles} of them disturbed");
+            assert!(text.contains(&says), "{text}");
+        }
     }
 }
