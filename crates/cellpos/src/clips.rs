@@ -5,16 +5,26 @@ use cellpos_session::clips::{ClipConfig, Clips, Schedule};
 use cellpos_session::{Failure, Rig};
 use std::path::Path;
 
-/// The clips of the next run on a rig, into its folder. Without frames or on the virtual clock there are no clips.
+/// The clips of the next run on a rig, into its folder. Without frames or on the virtual clock there are no clips; a warning says so if
+/// they were asked for.
 pub(crate) fn of(
     rig: &mut Rig,
     folder: &Path,
-    wishes: &ClipWishes,
+    asked: Option<&ClipWishes>,
 ) -> Result<Option<Clips>, Failure> {
     let source = rig.source();
-    if source.width_px == 0 || rig.clock().is_virtual() {
+    let none = match (rig.clock().is_virtual(), source.width_px) {
+        (true, _) => Some("there are no pictures on the virtual clock (--clock real has them)"),
+        (false, 0) => Some("there are no pictures with --frames off"),
+        _ => None,
+    };
+    if let Some(why) = none {
+        if asked.is_some() {
+            tracing::warn!("[clips]: no clip is kept, because {why}");
+        }
         return Ok(None);
     }
+    let wishes = asked.cloned().unwrap_or_default();
     let config = ClipConfig {
         before_s: wishes.before_s,
         after_s: wishes.after_s,

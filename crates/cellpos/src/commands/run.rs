@@ -336,7 +336,7 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     let mut view = (args.view).open(&mut rig, &setup, &shown, keys::OF_A_SCRIPT, &typed)?;
     view.iter().for_each(|view| view.recorded_in(&session));
     let wishes = script.clips.clone().unwrap_or_default();
-    let clips = clips::of(&mut rig, &session, &wishes)?;
+    let clips = clips::of(&mut rig, &session, script.clips.as_ref())?;
     let schedule = clips::schedule(&plan, &wishes);
     let sink = sink.with_page(view.is_some());
     let sink = Clipped::new(sink, clips, schedule, wishes.events);

@@ -15,7 +15,6 @@ use cellpos_numeric::units::{Micrometers, Seconds};
 use cellpos_record::RunWriter;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Summary};
-use cellpos_script::ClipWishes;
 use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::cyclic::{self, LearnSpec, Sine};
@@ -185,7 +184,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let clips = match recording.folder() {
         Some(folder) => {
             view.iter().for_each(|view| view.recorded_in(&folder));
-            clips::of(&mut rig, &folder, &ClipWishes::default())?
+            clips::of(&mut rig, &folder, None)?
         }
         None => None,
     };

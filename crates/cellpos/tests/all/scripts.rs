@@ -426,3 +426,20 @@ fn a_script_that_looks_at_a_length_is_refused_where_nobody_measures_one() {
     }
     assert_eq!(std::fs::read_dir(at.join("runs")).unwrap().count(), 4);
 }
+
+#[test]
+fn a_script_that_wants_clips_says_where_there_are_no_pictures() {
+    let folder = tempfile::tempdir().unwrap();
+    let hold = "[[step]]\ndo = \"hold\"\nduration = \"200ms\"\n";
+    for (name, clips, said) in [
+        ("plain", "", false),
+        ("film", "[clips]\nbefore = \"20ms\"\n", true),
+    ] {
+        let file = format!("{name}.toml");
+        let text = format!("name = \"{name}\"\n{clips}{hold}");
+        std::fs::write(folder.path().join(&file), text).unwrap();
+        let (code, _, err) = cellpos(folder.path(), &["run", &file, "--clock", "virtual"]);
+        assert_eq!(code, Some(0), "{err}");
+        assert_eq!(err.contains("no clip is kept"), said, "{err}");
+    }
+}
