@@ -1,6 +1,7 @@
 """Runs that the tests look at, made once by the program itself."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,9 @@ try:
 except ImportError:
     sys.path.insert(0, str(ROOT / "python/src"))
     import cellpos
+
+# What a shell starts in the background ignores Ctrl-C, and so would the programs that the tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 LONG = """name = "long"
 [[step]]

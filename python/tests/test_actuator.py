@@ -289,7 +289,7 @@ def test_a_bead_is_held_by_a_function_called_every_20_ms(lab_of_pressure):
     nm = 1e3 * np.sqrt(np.nanmean(error_um**2))
     bound = result["bound_rms_nm"]
     print(f"held over Python at 50 Hz: {nm:.0f} nm RMS in {len(error_um)} of {result['ticks']} ticks, least {bound:.0f}: {nm / bound:.3f}")
-    assert len(error_um) > enough / 4 and np.isnan(error_um).mean() < 0.01
+    assert len(error_um) > enough / 4 and np.isnan(error_um).mean() < 0.05
     # Three standard errors, so that one correct run in a thousand fails.
     independent = len(error_um) / 2
     assert nm < 1.15 * bound * (1 + 3 / (2 * independent) ** 0.5)
