@@ -145,16 +145,12 @@ fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted
     let text = stdout(&output);
     let r: Value = serde_json::from_str(&text).unwrap_or_default();
     let why = String::from_utf8_lossy(&output.stderr);
-    // A bead may stray while the machine stalls on top of the line: the run says so, and goes on.
-    let kept = [
-        (Some(0), "running".into()),
-        (Some(1), Value::from("not-kept")),
-    ];
-    assert!(
-        r["end"] == "duration" && kept.contains(&(output.status.code(), r["state"].clone())),
-        "{text}\n{why}"
-    );
+    assert_eq!(r["end"], "duration", "{text}\n{why}");
     let count = |key: &str| r[key].as_u64().unwrap_or_else(|| panic!("{key}: {r}"));
+    // A bead that strays is a matter of this machine only if the run counts a stall of it.
+    let strayed = r["state"] == "not-kept" && count("skipped") > 0;
+    let kept = r["state"] == "running" && output.status.success();
+    assert!(kept || strayed, "{text}\n{why}");
     let (lost, not_taken) = (count("commands_lost"), count("commands_not_taken"));
     // The stall of 180 ms alone loses the commands that the line did not take: most of those sent during the stall.
     assert!(
