@@ -1,8 +1,9 @@
-//! A step of the flow, as a hypothesis beside the quiet walk of neutral.
+//! A step of the flow, as a hypothesis next to the quiet walk of neutral.
 //!
-//! A tap on the syringe or a valve moves neutral at once by what a walk would take minutes for. Where the last fixes are off together is
-//! weighed under both: the normal density of the sum of their innovations, and a step before any of them, of any magnitude on a
-//! logarithmic scale. A fast flow shows in one fix, a slow one in several. Where a step is likelier, neutral moves by what it would take.
+//! A tap on the syringe or a valve moves neutral at once as far as the walk does in minutes. Two hypotheses compete for the innovations of
+//! the last fixes. In a quiet flow their sum has a normal density. After a step of the flow before any one fix it may have any magnitude
+//! on a logarithmic scale. A fast flow shows in one fix, a slow one in several. If the step is likelier, neutral moves by the step that
+//! explains the sum.
 
 use super::covariance::corrected;
 use super::{Estimator, EstimatorState, Fix, HISTORY};
