@@ -14,6 +14,7 @@ cargo() {
     case "$1" in
         run) shift; while [ "$1" != "--" ]; do shift; done; shift; cellpos "$@" ;;
         build) ;;
+        test) [ "$*" = "test --workspace" ] ;; # this very run
         *) echo "the test does not know cargo $1" >&2; return 1 ;;
     esac
 }
