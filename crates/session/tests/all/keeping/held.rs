@@ -28,6 +28,9 @@ pub(super) struct Row {
     /// Speed of the flow that steps, um/s.
     pub flow_um_per_s: f64,
     pub events: Vec<(FaultKind, f64)>,
+    /// They come so often, and begin so far apart, s.
+    pub times: usize,
+    pub every_s: f64,
     pub clip_um: f64,
     /// The rig has none of the imperfections of a real one: the limits of the table are those of such a rig.
     pub ideal: bool,
@@ -48,6 +51,8 @@ impl Row {
             second_um: None,
             flow_um_per_s: 0.0,
             events: Vec::new(),
+            times: 1,
+            every_s: 0.0,
             clip_um: 40.0,
             ideal: true,
             seconds: 4.0,
@@ -64,6 +69,15 @@ impl Row {
             events: vec![(FaultKind::FlowStep, 0.7)],
             ..Self::quiet(law)
         }
+    }
+
+    /// The same with its events so often, with 0.35 s for the bead to come to rest after each.
+    pub(super) fn again(mut self, times: usize) -> Self {
+        let longest_s = self.events.iter().map(|event| event.1).fold(0.0, f64::max);
+        self.every_s = longest_s + 0.35;
+        self.times = times;
+        self.seconds = EVENT_S + times as f64 * self.every_s;
+        self
     }
 
     /// A fault by its name in rig.toml, for a time.
@@ -148,7 +162,6 @@ impl Row {
         if self.gain != 1.0 {
             world.model = plant(self.gain);
         }
-        let mut events = self.events.clone();
         if let Some(um) = self.second_um {
             world.faults.second_bead_um = um;
             world.faults.event.push(FaultEvent {
@@ -158,14 +171,14 @@ impl Row {
             });
             file.near_um = Some(0.0);
         }
-        file.emulator
-            .faults
-            .event
-            .extend(events.drain(..).map(|(kind, for_s)| FaultEvent {
-                kind,
-                at_s: EVENT_S,
-                for_s: Some(for_s),
-            }));
+        for (kind, for_s) in &self.events {
+            let again = (0..self.times).map(|k| FaultEvent {
+                kind: *kind,
+                at_s: EVENT_S + k as f64 * self.every_s,
+                for_s: Some(*for_s),
+            });
+            file.emulator.faults.event.extend(again);
+        }
         file
     }
 
@@ -226,8 +239,8 @@ pub(super) struct Held {
     pub why: Option<String>,
     pub as_asked: bool,
     pub ended: String,
-    /// Largest true distance from the target from the event on, um.
-    pub worst_um: f64,
+    /// Largest true distance from the target from each event on, um.
+    pub furthest_um: Vec<f64>,
     /// RMS of the true distance over the ticks whose errors count, and the one that the run states, nm.
     pub true_rms_nm: f64,
     pub stated_rms_nm: f64,
@@ -244,6 +257,11 @@ pub(super) struct Held {
 }
 
 impl Held {
+    /// Largest true distance from the target after any event, um.
+    pub(super) fn worst_um(&self) -> f64 {
+        self.furthest_um.iter().copied().fold(0.0, f64::max)
+    }
+
     pub(super) const HEAD: &'static str =
         "row | worst um, RMS nm true (stated), held % true (stated), away ms, state";
 }
@@ -253,7 +271,7 @@ impl fmt::Display for Held {
         write!(
             f,
             "{:.2} | {:.1} ({:.1}) | {:.2} ({:.2}) | {:.0} | {}{}",
-            self.worst_um,
+            self.worst_um(),
             self.true_rms_nm,
             self.stated_rms_nm,
             self.true_held_percent,
@@ -271,6 +289,7 @@ impl fmt::Display for Held {
 pub(super) fn hold(row: &Row, seed: u64) -> Held {
     let finished = finish(row, seed, ReferenceSpec::Hold { position_um: 0.0 });
     judged(
+        row,
         &finished.sink.0,
         &finished.summary,
         finished.ended.as_asked(),
@@ -333,6 +352,7 @@ fn finish(row: &Row, seed: u64, reference: ReferenceSpec) -> Finished<Ticks> {
 }
 
 fn judged(
+    row: &Row,
     ticks: &[TickRecord],
     summary: &cellpos_runtime::Summary,
     as_asked: bool,
@@ -358,6 +378,18 @@ fn judged(
     let n = counted().count().max(1) as f64;
     let squares: f64 = counted().map(|t| off_um(t).powi(2)).sum();
     let held = counted().filter(|t| off_um(t) <= within_um).count() as f64;
+    let mut furthest_um = vec![0.0_f64; row.times];
+    for t in after() {
+        let since_s = (t.time_ns - FROM_NS) as f64 * 1e-9;
+        let event = if row.times > 1 {
+            (since_s / row.every_s) as usize
+        } else {
+            0
+        };
+        if let Some(um) = furthest_um.get_mut(event) {
+            *um = um.max(off_um(t));
+        }
+    }
     let (mut away_ns, mut since_ns) = (0, None);
     for t in after() {
         if off_um(t) > within_um {
@@ -385,7 +417,7 @@ fn judged(
         }),
         as_asked,
         ended,
-        worst_um: after().map(off_um).fold(0.0, f64::max),
+        furthest_um,
         true_rms_nm: (squares / n).sqrt() * 1e3,
         stated_rms_nm: kept.rms_nm.unwrap_or(f64::NAN),
         true_held_percent: 100.0 * held / n,
