@@ -44,6 +44,7 @@ mod outline;
 mod pool;
 pub mod profile;
 mod range;
+mod reach;
 mod residue;
 mod seed;
 mod smooth;

@@ -2,6 +2,7 @@
 
 use crate::blobs::Blobs;
 use crate::config::MAX_WINDOW_PX;
+use crate::fix::squared;
 use crate::frame::{Frame, Pixels};
 use crate::seed;
 use crate::speckle;
@@ -31,6 +32,52 @@ pub(crate) struct Object {
     pub y_px: f64,
     pub radius_px: f64,
     pub contrast: f64,
+}
+
+/// An object that a profile is learnt from.
+#[derive(Debug, Clone)]
+pub(crate) struct Bead {
+    pub at: Object,
+    /// Places of the objects about it, px.
+    others: Vec<(f64, f64)>,
+}
+
+impl Bead {
+    /// The object, with those of `all`, in the order of their frames, that may be nearer to a pixel within `reach_px` than it is.
+    pub(crate) fn among(at: &Object, all: &[Object], reach_px: f64) -> Self {
+        let place = |o: &Object| (o.x_px, o.y_px);
+        let first = all.partition_point(|o| o.frame < at.frame);
+        let end = all.partition_point(|o| o.frame <= at.frame);
+        let near = |o: &&Object| {
+            place(o) != place(at)
+                && squared(o.x_px - at.x_px, o.y_px - at.y_px) < (2.0 * reach_px).powi(2)
+        };
+        Bead {
+            at: *at,
+            others: all[first..end].iter().filter(near).map(place).collect(),
+        }
+    }
+
+    /// Distances from its place of the pixels up to `reach_px` along row and column, px, and their grey values. Pixels that are
+    /// nearer to another object are not among them.
+    pub(crate) fn pixels<'a>(
+        &'a self,
+        flats: &'a [Flat],
+        reach_px: f64,
+    ) -> Option<impl Iterator<Item = (f64, f64)> + 'a> {
+        let flat = flats.get(self.at.frame)?;
+        let (x_px, y_px) = (self.at.x_px, self.at.y_px);
+        let (x0, x1) = crate::template::span(x_px, reach_px, flat.width);
+        let (y0, y1) = crate::template::span(y_px, reach_px, flat.height);
+        let all = (y0..y1).flat_map(move |y| (x0..x1).map(move |x| (x, y)));
+        Some(all.filter_map(move |(x, y)| {
+            let (u, v) = (x as f64, y as f64);
+            let off_px2 = squared(u - x_px, v - y_px);
+            let nearest = |(a, b): &(f64, f64)| squared(u - a, v - b) >= off_px2;
+            let own = self.others.iter().all(nearest);
+            own.then(|| (off_px2.sqrt(), f64::from(flat.values[y * flat.width + x])))
+        }))
+    }
 }
 
 /// A frame as grey levels above its smooth background.

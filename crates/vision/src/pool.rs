@@ -16,6 +16,11 @@ impl Pool {
         self.mean += (value - self.mean) * (1.0 / self.fixes).max(FORGETTING);
     }
 
+    /// The mean; `None` before the first value.
+    pub(crate) fn usual(&self) -> Option<f64> {
+        (self.fixes > 0.0).then_some(self.mean)
+    }
+
     /// Takes in a value that is known from some fixes and gives it drawn towards the mean of all, as if that were known from
     /// `weight` of them.
     pub(crate) fn shrink(&mut self, own: f64, fixes: f64, weight: f64) -> f64 {

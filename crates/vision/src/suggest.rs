@@ -8,8 +8,9 @@ use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
 use crate::fix::FixQuality;
 use crate::frame::Frame;
 use crate::localiser::Localiser;
-use crate::objects::{Flat, Object, Refused};
+use crate::objects::{Bead, Flat, Object, Refused};
 use crate::range::Range;
+use crate::reach;
 use crate::smooth::{Learnt, Parametric, Rings};
 use crate::template::{ProfileSpec, TABLE_KNOTS, Template};
 
@@ -19,10 +20,12 @@ const PASSES: usize = 4;
 const ALIKE: (f64, f64) = (1.3, 1.7);
 /// Fewest objects that make a profile.
 const FEWEST: usize = 5;
-/// Farthest that a profile is followed, in radii of the region that stands out.
-const REACH: f64 = 1.6;
-/// Share of the profile's extreme below which there is nothing left of it.
-const FADED: f64 = 0.03;
+/// Least distance up to which a profile is learnt, in radii of the region that stands out, and that up to which its end is looked for.
+const REACH: (f64, f64) = (1.6, 3.2);
+/// Share of its extreme that a profile has at the bead's radius: that of a Gaussian at twice its standard deviation.
+const AT_RADIUS: f64 = 0.135;
+/// Share of a table in which it goes to zero.
+const FADE: f64 = 4.0 / (TABLE_KNOTS - 1) as f64;
 /// Kinds of objects tried, the commonest first.
 const KINDS: usize = 3;
 /// Margin on the residual that the beads themselves have: that of nine in ten, since dust and neighbours spoil some.
@@ -95,6 +98,7 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
     for (n, flat) in flats.iter().enumerate() {
         flat.objects(n, &mut objects, &mut refused);
     }
+    let all = objects.clone();
     let seen = objects.len() + refused.at_border;
     let count = frames.len();
     if objects.is_empty() {
@@ -110,7 +114,7 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
         // Those that have no common round shape, as pairs of beads in any direction, may hide others that have.
         objects.retain(|o| !alike.contains(o));
         refused.other = total - alike.len();
-        match learn(frames, &flats, alike, refused) {
+        match learn(frames, &flats, (alike, &all), refused) {
             Ok(suggestion) => {
                 return Ok(Suggestion {
                     objects: seen,
@@ -158,7 +162,7 @@ pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, Nothing
         other: seen - alike.len(),
         ..Refused::default()
     };
-    let suggestion = learn(frames, &flats, alike, refused)?;
+    let suggestion = learn(frames, &flats, (alike, &objects), refused)?;
     Ok(Suggestion {
         objects: seen,
         ..suggestion
@@ -168,10 +172,15 @@ pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, Nothing
 fn learn(
     frames: &[Frame],
     flats: &[Flat],
-    mut beads: Vec<Object>,
+    (alike, all): (Vec<Object>, &[Object]),
     mut refused: Refused,
 ) -> Result<Suggestion, NothingToSuggest> {
-    let reach_px = REACH * median(beads.iter().map(|o| o.radius_px));
+    let region_px = median(alike.iter().map(|o| o.radius_px));
+    let mut reach_px = REACH.0 * region_px;
+    let end_px = (REACH.1 * region_px).min(0.5 * MAX_WINDOW_PX as f64);
+    let beads = alike.iter().map(|o| Bead::among(o, all, end_px));
+    let mut beads: Vec<Bead> = beads.collect();
+    let mut snr = f64::INFINITY;
     let objects = beads.len();
     let failed = NothingToSuggest::NoProfile { objects };
     let mut config = None;
@@ -179,14 +188,23 @@ fn learn(
     let mut fits = Vec::new();
     let mut filled = 1.0_f64;
     for pass in 0..PASSES {
+        if let Some(template) = &template {
+            let with_contrast = |bead| {
+                let pixels = Bead::pixels(bead, flats, reach_px)?;
+                Some((bead, contrast_and_level(template, pixels)?.0))
+            };
+            let seen = beads.iter().filter_map(with_contrast);
+            let extent_px = reach::of_beads(flats, seen, end_px as usize, snr);
+            reach_px = reach_px.max(extent_px / (1.0 - FADE));
+        }
         let rings = collect(flats, &beads, template.as_ref(), reach_px);
         let parametric = rings.parametric().ok_or(failed)?;
         let learnt = rings.learn_from(parametric).ok_or(failed)?;
-        let mut settings = settings(&learnt, parametric, reach_px).ok_or(failed)?;
+        let mut settings = settings(&learnt, parametric, reach_px, snr).ok_or(failed)?;
         settings.template_tolerance = MOST_TOLERANCE;
         let mut localiser = Localiser::new(settings.clone()).map_err(|_| failed)?;
         fits.clear();
-        for bead in &mut beads {
+        for bead in beads.iter_mut().map(|bead| &mut bead.at) {
             let Some(frame) = frames.get(bead.frame) else {
                 continue;
             };
@@ -198,6 +216,7 @@ fn learn(
             }
         }
         template = settings.template().ok();
+        snr = median(fits.iter().map(|(_, f)| f.snr));
         filled = localiser.filled();
         if fits.len() * 2 < objects && pass + 1 == PASSES {
             return Err(failed);
@@ -206,7 +225,6 @@ fn learn(
     }
     let mut config = config.ok_or(failed)?;
     refused.bad_fit = objects - fits.len();
-    let snr = median(fits.iter().map(|(_, f)| f.snr));
     // What the beads' own residuals need, with a margin for those not looked at.
     let needed = fits.iter().map(|(_, f)| {
         let excess = (f.residual_ratio - config.max_residual_ratio).max(0.0);
@@ -250,32 +268,23 @@ fn commonest(objects: &[Object]) -> Vec<Object> {
 /// off by the template of the pass before.
 fn collect(
     flats: &[Flat],
-    beads: &[Object],
+    beads: &[Bead],
     template: Option<&Template>,
     reach_px: f64,
 ) -> Box<Rings> {
     let mut rings = Box::new(Rings::new(reach_px));
     for bead in beads {
-        let Some(flat) = flats.get(bead.frame) else {
+        let Some(pixels) = bead.pixels(flats, reach_px) else {
             continue;
         };
-        let (x0, x1) = crate::template::span(bead.x_px, reach_px, flat.width);
-        let (y0, y1) = crate::template::span(bead.y_px, reach_px, flat.height);
-        let pixels = || {
-            (y0..y1)
-                .flat_map(move |y| (x0..x1).map(move |x| (x, y)))
-                .map(|(x, y)| {
-                    let r_px = f64::hypot(x as f64 - bead.x_px, y as f64 - bead.y_px);
-                    (r_px, f64::from(flat.values[y * flat.width + x]))
-                })
-        };
+        let pixels: Vec<(f64, f64)> = pixels.collect();
         let (contrast, level) = template
-            .and_then(|template| contrast_and_level(template, pixels()))
+            .and_then(|template| contrast_and_level(template, pixels.iter().copied()))
             .unwrap_or((1.0, 0.0));
         // The sign stays with the values: it is the polarity.
         let contrast = contrast.abs();
         rings.next_bead();
-        for (r_px, v) in pixels() {
+        for (r_px, v) in pixels {
             rings.add(r_px, (v - level) / contrast, contrast * contrast);
         }
     }
@@ -302,7 +311,12 @@ fn contrast_and_level(
 }
 
 /// Settings for a learnt profile.
-fn settings(learnt: &Learnt, parametric: Parametric, reach_px: f64) -> Option<LocaliserConfig> {
+fn settings(
+    learnt: &Learnt,
+    parametric: Parametric,
+    reach_px: f64,
+    snr: f64,
+) -> Option<LocaliserConfig> {
     if !learnt.deviates {
         let spec = match parametric {
             Parametric::Gaussian(sigma_px) => ProfileSpec::Gaussian {
@@ -329,19 +343,13 @@ fn settings(learnt: &Learnt, parametric: Parametric, reach_px: f64) -> Option<Lo
         return None;
     }
     let mut values = profile.map(|v| (v - floor) / extreme);
-    let last = values
-        .iter()
-        .rposition(|v| v.abs() > FADED)
-        .unwrap_or(TABLE_KNOTS - 1);
     for (k, v) in values.iter_mut().enumerate() {
         let fade = ((TABLE_KNOTS - 1 - k) as f64 / 4.0).min(1.0);
         *v *= fade;
     }
-    // The edge: where the step is largest, counted with the length of the edge.
-    let step = |k: usize| (values[k + 1] - values[k]).abs() * (k as f64 + 0.5);
-    let edge = (0..TABLE_KNOTS - 1).max_by(|a, b| step(*a).total_cmp(&step(*b)))?;
-    let radius_px = ((edge as f64 + 0.5) * knot_px).max(1.0);
-    let extent_px = ((last + 1) as f64 * knot_px).max(1.3 * radius_px);
+    let radius_px = (core_knots(&values) * knot_px).max(1.0);
+    let value = |r_px: f64| values[((r_px / knot_px).round() as usize).min(TABLE_KNOTS - 1)];
+    let extent_px = reach::extent_px(value, reach_px, snr).max(1.3 * radius_px);
     let spec = ProfileSpec::Table {
         radius_px: rounded(radius_px, 100.0),
         knot_px: rounded(knot_px, 1e4),
@@ -355,6 +363,16 @@ fn settings(learnt: &Learnt, parametric: Parametric, reach_px: f64) -> Option<Lo
         Polarity::Dark
     };
     Some(config)
+}
+
+/// Distance at which a profile first falls to [`AT_RADIUS`] of its extreme, outwards from there, in knots.
+fn core_knots(values: &[f64; TABLE_KNOTS]) -> f64 {
+    let size = |k: usize| values.get(k).map_or(0.0, |v| v.max(0.0));
+    let extreme = (0..TABLE_KNOTS).max_by(|a, b| size(*a).total_cmp(&size(*b)));
+    let first = (extreme.unwrap_or(0)..TABLE_KNOTS - 1).find(|k| size(k + 1) < AT_RADIUS);
+    first.map_or(TABLE_KNOTS as f64, |k| {
+        k as f64 + (size(k) - AT_RADIUS) / (size(k) - size(k + 1))
+    })
 }
 
 /// Farthest step of a bead between frames next to each other, with a margin; a bead's reach where there are none.

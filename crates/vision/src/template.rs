@@ -16,7 +16,7 @@ pub const TABLE_KNOTS: usize = 32;
 pub enum ProfileSpec {
     /// Learnt from a recording: a spline through values at equal distances, 1 at the extreme, 0 from the last on.
     Table {
-        /// Radius of the bead: where the profile is steepest, px.
+        /// Radius of the bead, px: where the profile has fallen to 0.135 of its extreme, as a Gaussian has at two standard deviations.
         radius_px: f64,
         /// Distance of the values, px.
         knot_px: f64,

@@ -7,11 +7,9 @@ use super::view::{Others, View};
 use crate::fit::Image;
 use crate::fix::{Fix, FixQuality, squared};
 use crate::frame::Frame;
+use crate::reach::extent_px;
 use crate::streak::Comb;
-use crate::template::Template;
 
-/// Share of a bead's contrast below which there is nothing left of its image.
-const FADED: f32 = 0.03;
 /// Share of a bead's contrast below which a bad fit beside it is no bead.
 const LEAST_SHARE: f64 = 0.3;
 /// Rounds in which fits and images taken off improve each other; the last one counts. The error falls by the overlap each time.
@@ -29,7 +27,10 @@ impl Localiser {
         fixes.clear();
         let mut drafted = Vec::new();
         let radius_px = self.template.radius_px();
-        let reach_px = 2.0 * extent_px(&self.template);
+        let template = &self.template;
+        let profile = |r_px: f64| f64::from(template.value_at_squared((r_px * r_px) as f32));
+        let snr = self.snr.usual().unwrap_or(f64::INFINITY);
+        let reach_px = 2.0 * extent_px(profile, template.support_px(), snr);
         for (n, (x, y)) in places.clone().enumerate() {
             let alone = places
                 .clone()
@@ -114,15 +115,4 @@ impl Localiser {
         }
         true
     }
-}
-
-/// Distance from its centre beyond which there is nothing left of a bead's image, px.
-fn extent_px(template: &Template) -> f64 {
-    let steps = 64;
-    let step_px = template.support_px() / f64::from(steps);
-    let shows = |k: &i32| {
-        let r_px = f64::from(*k) * step_px;
-        template.value_at_squared((r_px * r_px) as f32).abs() > FADED
-    };
-    f64::from((0..steps).rev().find(shows).unwrap_or(steps) + 1) * step_px
 }

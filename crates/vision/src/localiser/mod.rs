@@ -73,6 +73,8 @@ pub struct Localiser {
     /// What the last fixes were widened by, and their residual ratios.
     widened: Pool,
     ratio: Pool,
+    /// Contrast of the last good fixes over the noise of a pixel.
+    snr: Pool,
     /// Share of the beads' contrast in their windows that the last fixes left unexplained.
     unexplained: Pool,
     /// How much the pictures of beads that the template fits badly answer to a motion: see [`Residues::besides_the_mean`].
@@ -122,6 +124,7 @@ impl Localiser {
             lines: [Pool::default(); 2],
             widened: Pool::default(),
             ratio: Pool::default(),
+            snr: Pool::default(),
             unexplained: Pool::default(),
             answers: Pool::default(),
         })
@@ -301,6 +304,7 @@ impl Localiser {
         let whole = side_px == self.config.window_px && self.comb.is_still();
         if fix.verdict == FixQuality::Good && self.comb.is_still() {
             self.widened.take_in(widening);
+            self.snr.take_in(fix.snr);
         }
         if fix.verdict == FixQuality::Good && whole {
             self.update_noise();

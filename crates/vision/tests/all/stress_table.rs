@@ -332,3 +332,15 @@ fn beads_of_a_few_pixels_are_found_in_pictures_of_a_codec() {
     let rows = rows.map(|(snr, settings)| (0, snr, settings, Spoil::Jpeg));
     run(&rows, 250.0);
 }
+
+#[test]
+fn a_profile_is_learnt_as_far_as_the_image_of_a_bead_reaches() {
+    // A halo reaches 1.7 times as far as the region that stands out, and neighbours are within that. A blurred one has its
+    // steepest part outside the core that is detected.
+    let rows = [
+        (Settings::Pasted, Spoil::Neighbours),
+        (Settings::Suggested, Spoil::Blur(0.5)),
+    ];
+    let rows = rows.map(|(settings, spoil)| (8, 200.0, settings, spoil));
+    run(&rows, 100.0);
+}
