@@ -8,8 +8,9 @@ use crate::learning::Driven;
 use crate::limits::Limits;
 use crate::loop_io::{LoopFlags, LoopInput, LoopOutput, LoopParts, Measurement, Mode};
 use crate::path::{Path, PathState};
-use crate::plant_estimate::{AdaptState, Adaptation, Adapter, INTERVAL, TickOutcome};
+use crate::plant_estimate::{AdaptState, Adaptation, Adapter, TickOutcome};
 use crate::tuning::Tuning;
+use cellpos_numeric::statistics::student_t_quantile;
 
 /// State of a loop whose law has the state `S`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -124,14 +125,22 @@ impl<L: ControlLaw> ControlLoop<L> {
         Some(adapter.adaptation(state.adapt.as_ref()?))
     }
 
-    /// The gain over the model's was measured before the loop is closed, with this standard deviation: the estimate of the plant begins
-    /// there. The feed-forward of a loop that does not adapt is divided by the gain within the 95 % interval that is nearest to the model's.
-    pub fn start_estimate(&self, state: &mut LoopState<L::State>, gain: f64, sd: f64) {
-        let measured = gain.is_finite() && sd.is_finite() && sd > 0.0;
-        let (low, high) = (gain - INTERVAL * sd, gain + INTERVAL * sd);
-        match state.adapt.as_mut().filter(|_| measured) {
-            Some(adapt) => adapt.tell(gain, sd),
-            None => state.measured_gain = (measured && low > 0.0).then(|| 1.0_f64.clamp(low, high)),
+    /// The gain over the model's was measured before the loop is closed, with a standard deviation that is known from `dof` degrees of
+    /// freedom: the estimate of the plant begins there. The feed-forward of a loop that does not adapt is divided by the gain within the
+    /// 95 % interval that is nearest to the model's.
+    pub fn start_estimate(&self, state: &mut LoopState<L::State>, gain: f64, sd: f64, dof: f64) {
+        if !(gain.is_finite() && sd > 0.0 && dof >= 1.0) {
+            return;
+        }
+        match state.adapt.as_mut() {
+            // A normal distribution with the variance of Student's; with two degrees of freedom or fewer that is infinite.
+            Some(adapt) if dof > 2.0 => adapt.tell(gain, sd * (dof / (dof - 2.0)).sqrt()),
+            Some(_) => {}
+            None => {
+                let half = sd * student_t_quantile(0.975, dof);
+                let (low, high) = (gain - half, gain + half);
+                state.measured_gain = (low > 0.0).then(|| 1.0_f64.clamp(low, high));
+            }
         }
     }
 

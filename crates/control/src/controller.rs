@@ -54,7 +54,7 @@ trait AnyLoop: std::fmt::Debug + Send {
     fn step(&mut self, input: &LoopInput) -> LoopOutput;
     fn skip(&mut self);
     fn rest_at(&mut self, zero_flow_um: f64, variance_um2: f64);
-    fn start_estimate(&mut self, gain: f64, sd: f64);
+    fn start_estimate(&mut self, gain: f64, sd: f64, dof: f64);
     fn estimator(&self) -> &EstimatorState;
     fn previous_command_um(&self) -> f64;
     fn neutral_um(&self) -> f64;
@@ -89,8 +89,8 @@ impl<L: ControlLaw> AnyLoop for Running<L> {
             .rest_at(&mut self.state, zero_flow_um, variance_um2);
     }
 
-    fn start_estimate(&mut self, gain: f64, sd: f64) {
-        self.control.start_estimate(&mut self.state, gain, sd);
+    fn start_estimate(&mut self, gain: f64, sd: f64, dof: f64) {
+        self.control.start_estimate(&mut self.state, gain, sd, dof);
     }
 
     fn estimator(&self) -> &EstimatorState {
@@ -208,10 +208,9 @@ impl Controller {
         self.running.neutral_um()
     }
 
-    /// The gain over the model's was measured before the loop is closed, with this standard deviation; see
-    /// [`ControlLoop::start_estimate`].
-    pub fn start_estimate(&mut self, gain: f64, sd: f64) {
-        self.running.start_estimate(gain, sd);
+    /// The gain over the model's was measured before the loop is closed; see [`ControlLoop::start_estimate`].
+    pub fn start_estimate(&mut self, gain: f64, sd: f64, dof: f64) {
+        self.running.start_estimate(gain, sd, dof);
     }
 
     /// What is known of gain and delay of the plant, and the tuning in force; `None` where the loop does not adapt.

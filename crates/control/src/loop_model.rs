@@ -129,6 +129,14 @@ impl LoopModel {
     pub fn fast_gain_per_s(&self) -> f64 {
         self.gain_per_s + self.modes.iter().map(|m| m.residue_per_s).sum::<f64>()
     }
+
+    /// How late the bead's velocity follows a slow change of the displacement, s: the sum of the lags less that of the leads, without
+    /// `delay_s`. 1.5 ms for Eq. (6).
+    pub fn lag_s(&self) -> f64 {
+        let used = self.modes.iter().filter(|m| m.pole_rad_per_s != 0.0);
+        let modes: f64 = used.map(|m| m.residue_per_s / m.pole_rad_per_s).sum();
+        (modes - self.feedthrough) / self.gain_per_s
+    }
 }
 
 /// Poles slower than this count as integrators, rad/s: the drift state takes up what they lack.

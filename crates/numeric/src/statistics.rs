@@ -42,9 +42,12 @@ pub fn student_t_quantile(probability: f64, dof: f64) -> f64 {
 
 /// The value at which a rising function reaches `target`, by bisection between `low` and `high`.
 pub fn invert(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
-    // Two hundred halvings end at neighbouring numbers.
+    // Two hundred halvings end at neighbouring numbers, and most searches do before.
     for _ in 0..200 {
         let mid = 0.5 * (low + high);
+        if mid == low || mid == high {
+            break;
+        }
         if f(mid) < target {
             low = mid;
         } else {

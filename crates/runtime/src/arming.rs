@@ -8,6 +8,8 @@
 //! ones.
 
 use crate::life::Refusal;
+use cellpos_control::LoopModel;
+use cellpos_numeric::statistics::student_t_quantile;
 use cellpos_numeric::units::Seconds;
 use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
 use serde::{Deserialize, Serialize};
@@ -22,9 +24,9 @@ pub struct ArmingConfig {
     pub steady_ticks: u32,
     /// Ticks after which arming ends without a result, because the bead was not steadily seen.
     pub patience_ticks: u32,
-    /// Height of the doublet, um of PZT.
+    /// Height of the doublet, um of PZT; less where the plant's lags ask for a longer one.
     pub pulse_um: f64,
-    /// Ticks up, and ticks down.
+    /// Ticks up, and ticks down; more where the plant's lags are longer.
     pub pulse_ticks: u32,
     /// Smallest gain over the model's that is accepted.
     pub lowest_ratio: f64,
@@ -53,8 +55,10 @@ impl Default for ArmingConfig {
 pub struct GainCheck {
     /// Measured gain over the model's.
     pub gain_ratio: f64,
-    /// Half width of its 95 % interval.
-    pub ci95: f64,
+    /// Its standard deviation.
+    pub sd: f64,
+    /// Degrees of freedom from which that is known.
+    pub dof: f64,
     /// Why the plant is refused, if it is.
     pub refusal: Option<Refusal>,
     /// Whether the interval leaves no doubt about the refusal.
@@ -66,10 +70,19 @@ impl GainCheck {
     fn unmeasured(refusal: Option<Refusal>) -> Self {
         Self {
             gain_ratio: f64::NAN,
-            ci95: f64::NAN,
+            sd: f64::NAN,
+            dof: f64::NAN,
             refusal,
             sure: refusal != Some(Refusal::Disturbed),
         }
+    }
+
+    /// Half width of the 95 % interval of the gain.
+    pub fn ci95(&self) -> f64 {
+        if self.sd.is_nan() {
+            return f64::NAN;
+        }
+        self.sd * student_t_quantile(0.975, self.dof)
     }
 }
 
@@ -182,50 +195,64 @@ pub enum Step {
 }
 
 impl Arming {
-    /// Prepares the pulse for a plant seen through a camera path of `camera_delay`, with one fix in `ticks_per_fix` ticks. Patience and
-    /// pulse are longer by that factor.
+    /// Prepares the pulse for a plant seen through a camera path of `camera_delay`, with one fix in `ticks_per_fix` ticks. `model` is the
+    /// plant as the loop sees it. Patience and pulse are longer by the ticks of a fix.
+    ///
+    /// A pulse that is shorter than the plant's lags measures the gain over the lags, and moves the bead little. Such a pulse is made as
+    /// long as the lags, and as high as moves the bead as far as the configured pulse does without lags.
     ///
     /// # Errors
     /// The plant cannot be discretised.
     pub fn new(
         config: ArmingConfig,
         plant: &TransferFunction,
-        sample: Seconds,
+        model: &LoopModel,
         camera_delay: Seconds,
         ticks_per_fix: f64,
     ) -> Result<Self, PlantError> {
         let times = ticks_per_fix.ceil().max(1.0) as u32;
-        let least = config.pulse_ticks;
-        let config = ArmingConfig {
-            patience_ticks: config.patience_ticks.saturating_mul(times),
-            pulse_ticks: config.pulse_ticks.saturating_mul(times),
-            ..config
-        };
+        let sample = Seconds(model.sample_time_s);
+        let ticks = |seconds: f64| (seconds / sample.value()).ceil().max(0.0) as u32;
         let discrete = DiscretePlant::new(plant, sample, camera_delay)?;
-        let rest = (camera_delay.value() / sample.value()).ceil() as u32 + 4;
-        let up = config.pulse_ticks;
-        let program_um: Vec<f64> = (0..2 * up + rest)
-            .map(|tick| match tick {
-                tick if tick < up => config.pulse_um,
-                tick if tick < 2 * up => -config.pulse_um,
-                _ => 0.0,
-            })
-            .collect();
-        let mut state = discrete.state(0.0);
-        let positions_um = program_um
-            .iter()
-            .map(|&command_um| {
+        let rest = ticks(camera_delay.value()) + ticks(2.0 * model.lag_s()).max(4);
+        let without_lags = config.pulse_ticks.saturating_mul(times);
+        let up = without_lags.max(ticks(model.lag_s()));
+        let answer_um = |program_um: &[f64]| -> Vec<f64> {
+            let mut state = discrete.state(0.0);
+            let answer = program_um.iter().map(|&command_um| {
                 let now_um = discrete.output_um(&state);
                 discrete.step(&mut state, command_um);
                 now_um
-            })
-            .collect();
+            });
+            answer.collect()
+        };
+        let doublet = |height_um: f64| -> Vec<f64> {
+            let at = |tick| match tick {
+                tick if tick < up => height_um,
+                tick if tick < 2 * up => -height_um,
+                _ => 0.0,
+            };
+            (0..2 * up + rest).map(at).collect()
+        };
+        let mut height_um = config.pulse_um;
+        if up > without_lags {
+            let reach = |um: &[f64]| um.iter().fold(0.0_f64, |most, um| most.max(um.abs()));
+            let area_um_s = config.pulse_um * f64::from(without_lags) * sample.value();
+            height_um = (model.gain_per_s * area_um_s).abs() / reach(&answer_um(&doublet(1.0)));
+        }
+        let program_um = doublet(height_um);
+        let config = ArmingConfig {
+            patience_ticks: config.patience_ticks.saturating_mul(times),
+            pulse_um: height_um,
+            pulse_ticks: up,
+            ..config
+        };
         Ok(Self {
             config,
-            least,
+            least: up / times,
             most_silent: MOST_SILENT.saturating_mul(times),
+            positions_um: answer_um(&program_um),
             program_um,
-            positions_um,
             settling_ticks: rest,
         })
     }
@@ -354,12 +381,20 @@ impl Arming {
             return None;
         }
         let gain_ratio = sxy / sxx;
-        let variance = ((syy - gain_ratio * sxy) / (s.n - 2.0).max(1.0)).max(0.0);
-        let ci95 = 1.96 * (variance / sxx).sqrt();
+        let dof = (s.n - 2.0).max(1.0);
+        let sd = (((syy - gain_ratio * sxy) / dof).max(0.0) / sxx).sqrt();
+        let mut found = GainCheck {
+            gain_ratio,
+            sd,
+            dof,
+            refusal: None,
+            sure: true,
+        };
+        let ci95 = found.ci95();
         let accepted = self.config.lowest_ratio..=self.config.highest_ratio;
         let (low, high) = (gain_ratio - ci95, gain_ratio + ci95);
         let outside = high < *accepted.start() || low > *accepted.end();
-        let (refusal, sure) = if gain_ratio.abs() <= 2.0 * ci95 {
+        (found.refusal, found.sure) = if gain_ratio.abs() <= 2.0 * ci95 {
             (Some(Refusal::NoResponse), outside)
         } else if gain_ratio < 0.0 {
             (Some(Refusal::WrongSign), true)
@@ -368,12 +403,7 @@ impl Arming {
         } else {
             (None, true)
         };
-        Some(GainCheck {
-            gain_ratio,
-            ci95,
-            refusal,
-            sure,
-        })
+        Some(found)
     }
 }
 

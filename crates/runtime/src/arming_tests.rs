@@ -37,8 +37,14 @@ fn arm(
     mut seen: impl FnMut(u32, f64) -> Option<f64>,
     time: impl Fn(u32) -> (u32, bool),
 ) -> (GainCheck, f64, u32) {
-    let arming =
-        Arming::new(config, &TransferFunction::eq6(), SAMPLE, DELAY, 1.0).expect("eq6 is a plant");
+    let arming = Arming::new(
+        config,
+        &TransferFunction::eq6(),
+        &LoopModel::eq6(2e-3),
+        DELAY,
+        1.0,
+    )
+    .expect("eq6 is a plant");
     let plant =
         DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, delay).expect("eq6 is a plant");
     let mut truth = plant.state(0.0);
@@ -79,7 +85,7 @@ fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
     let arming = Arming::new(
         ArmingConfig::default(),
         &TransferFunction::eq6(),
-        SAMPLE,
+        &LoopModel::eq6(2e-3),
         DELAY,
         1.0,
     )
@@ -116,7 +122,7 @@ fn the_plant_of_the_model_passes_with_a_ratio_of_one() {
     let (verdict, largest) = run(ArmingConfig::default(), 1.0, |_| false);
     assert_eq!(verdict.refusal, None);
     assert!(
-        (verdict.gain_ratio - 1.0).abs() < verdict.ci95.max(0.02),
+        (verdict.gain_ratio - 1.0).abs() < verdict.ci95().max(0.02),
         "{verdict:?}"
     );
     assert_eq!(largest, 0.5);
@@ -263,4 +269,98 @@ fn a_few_missing_frames_do_not_matter() {
         tick > 25 && tick % 7 == 0
     });
     assert_eq!(verdict.refusal, None);
+}
+
+/// A bead in Brownian motion (0.33 um^2/s) behind a plant of the model's gain, at these ticks: the check, and how far the pulse moved it, um.
+fn arm_in_brownian_motion(
+    plant: &TransferFunction,
+    model: &LoopModel,
+    seed: u32,
+) -> (GainCheck, f64) {
+    let sample = Seconds(model.sample_time_s);
+    let config = ArmingConfig {
+        // 10 ms, or one tick.
+        pulse_ticks: (0.01 / sample.value()).ceil() as u32,
+        ..ArmingConfig::default()
+    };
+    let arming = Arming::new(config, plant, model, DELAY, 1.0).expect("a plant");
+    let plant = DiscretePlant::new(plant, sample, DELAY).expect("a plant");
+    let mut truth = plant.state(0.0);
+    let mut state = ArmingState::default();
+    let mut random = seed.wrapping_mul(2_654_435_761);
+    let mut uniform = || {
+        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f64::from(random >> 8) / f64::from(1u32 << 24) - 0.5
+    };
+    let step_um = (2.0 * 0.33 * sample.value()).sqrt();
+    let (mut wander_um, mut command, mut farthest) = (0.0, 20.0, 0.0_f64);
+    loop {
+        let answer_um = plant.output_um(&truth);
+        farthest = farthest.max(answer_um.abs());
+        wander_um += step_um * (0..12).map(|_| uniform()).sum::<f64>();
+        let input = ArmingInput {
+            position_um: Some(answer_um + wander_um),
+            framed: true,
+            command_um: command,
+            neutral_um: 20.0,
+            disturbed: false,
+            steps: 1,
+        };
+        match arming.step(&mut state, &input) {
+            Step::Command(next) | Step::Again(next, _) => command = next,
+            Step::Done(check) => return (check, farthest),
+        }
+        plant.step(&mut truth, command - 20.0);
+    }
+}
+
+#[test]
+fn the_interval_of_the_gain_holds_behind_a_fast_and_a_slow_actuator() {
+    // A regulator of 50 ms and a tube of 20 ms behind commands every 20 ms.
+    let behind = |pole: f64, residue: f64| cellpos_control::LoopMode {
+        pole_rad_per_s: pole,
+        residue_per_s: residue,
+    };
+    let slow = LoopModel {
+        modes: [
+            behind(-20.0, -428.0 * 5.0 / 3.0),
+            behind(-50.0, 428.0 * 2.0 / 3.0),
+        ],
+        sample_time_s: 20e-3,
+        ..LoopModel::integrator(428.0, 2e-3)
+    };
+    assert!((slow.lag_s() - 0.07).abs() < 1e-12);
+    let lag = |s: f64| TransferFunction::new(vec![1.0], vec![s, 1.0]).expect("a lag");
+    let bare = TransferFunction::integrator(428.0).expect("a plant");
+    let tube = bare
+        .series(&lag(0.05))
+        .and_then(|one| one.series(&lag(0.02)))
+        .expect("a plant");
+    for (name, plant, model, most_sd) in [
+        ("1 kHz", TransferFunction::eq6(), LoopModel::eq6(2e-3), 0.04),
+        ("20 ms and lags", tube, slow, 0.06),
+    ] {
+        const RUNS: u32 = 400;
+        let (mut inside, mut squares, mut farthest) = (0, 0.0, 0.0_f64);
+        for seed in 0..RUNS {
+            let (check, far_um) = arm_in_brownian_motion(&plant, &model, seed);
+            assert_eq!(check.refusal, None, "{name}: {check:?}");
+            inside += u32::from((check.gain_ratio - 1.0).abs() < check.ci95());
+            squares += (check.gain_ratio - 1.0).powi(2);
+            farthest = farthest.max(far_um);
+        }
+        let (share, sd) = (
+            f64::from(inside) / f64::from(RUNS),
+            (squares / f64::from(RUNS)).sqrt(),
+        );
+        println!(
+            "{name}: {share:.3} of the intervals hold, sd {sd:.3}, the bead goes {farthest:.2} um"
+        );
+        // A share of 0.95 of 400 has a standard deviation of 0.011.
+        assert!(
+            (0.92..0.98).contains(&share) && sd < most_sd,
+            "{name}: {share}, {sd}"
+        );
+        assert!(farthest < 4.5, "{name}: {farthest} um");
+    }
 }

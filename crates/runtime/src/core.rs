@@ -165,7 +165,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let arming = Arming::new(
             arming,
             plant,
-            Seconds(sample_s),
+            &controller.settings().model,
             Seconds(timing.camera_delay_ms * 1e-3),
             estimator.ticks_per_fix,
         )?;

@@ -31,9 +31,8 @@ use dither::Dither;
 use evidence::Evidence;
 use lines::{LineSettings, Lines};
 use motion::Motion;
-pub(crate) use retuning::INTERVAL;
 pub use retuning::{AdaptMode, AdaptNews};
-use retuning::{DELAYS, NOMINAL, REPORTED_GAIN, Retuning, TUNINGS};
+use retuning::{DELAYS, INTERVAL, NOMINAL, REPORTED_GAIN, Retuning, TUNINGS};
 use serde::Serialize;
 use whiten::{Covariance, Track, Whitener};
 

@@ -85,7 +85,7 @@ impl<R: ReferenceGenerator> Core<R> {
                         tick.event(EventKind::ArmingRepeated {
                             refusal,
                             gain_ratio: verdict.gain_ratio,
-                            ci95: verdict.ci95,
+                            ci95: verdict.ci95(),
                         });
                     }
                     return Mode::Direct(command_um);
@@ -95,17 +95,17 @@ impl<R: ReferenceGenerator> Core<R> {
                         tick.event(EventKind::ArmingRefused {
                             refusal,
                             gain_ratio: verdict.gain_ratio,
-                            ci95: verdict.ci95,
+                            ci95: verdict.ci95(),
                         });
                         self.latch(SafeReason::ArmingRefused, tick);
                     }
                     None => {
                         self.controller
-                            .start_estimate(verdict.gain_ratio, verdict.ci95 / 1.96);
+                            .start_estimate(verdict.gain_ratio, verdict.sd, verdict.dof);
                         if verdict.gain_ratio.is_finite() {
                             tick.event(EventKind::ArmingPassed {
                                 gain_ratio: verdict.gain_ratio,
-                                ci95: verdict.ci95,
+                                ci95: verdict.ci95(),
                             });
                         }
                         tick.event(EventKind::Running);
