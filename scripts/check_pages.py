@@ -65,6 +65,7 @@ addEventListener("load", () => {
     const texts = [...svg.querySelectorAll("text")].filter(t => t.textContent.trim());
     const boxes = texts.map(t => [t, t.getBoundingClientRect()]);
     for (const [t, b] of boxes) {
+      if (/\u2026|\.\.\.$/.test(t.textContent)) found.push(`${name}: "${t.textContent}" is shortened`);
       if (b.left < frame.left - 1 || b.right > frame.right + 1 || b.top < frame.top - 1 || b.bottom > frame.bottom + 1)
         found.push(`${name}: "${t.textContent}" is cut off`);
       // Its ground is the last area drawn before it and below its middle.

@@ -50,7 +50,7 @@ pub use thresholds::{THRESHOLDS, Thresholds};
 pub use units::{Units, figure, figure_of};
 pub use verdict::battery::{Hypothesis, Term};
 pub use verdict::guard::looks_like_volts;
-pub use verdict::map::{BAND_EDGES_HZ, Cell, DiscrepancyMap, MapRow, band_labels};
+pub use verdict::map::{Cell, DiscrepancyMap, MapRow};
 pub use verdict::response::BandRatio;
 pub use verdict::result::{
     BandGap, Effect, Gap, GapStep, Interval, Reconciliation, RecordGap, Remainder, Trace, Traces,

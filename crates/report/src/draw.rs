@@ -150,6 +150,7 @@ mod tests {
                 let (x, y) = (number(tag, "x"), number(tag, "y"));
                 let wide = text_width_px(text);
                 let (low, high, long) = match attribute(tag, "text-anchor") {
+                    Some("end") if tag.contains("rotate") => (y, y + wide, h),
                     _ if tag.contains("rotate") => (y - wide / 2.0, y + wide / 2.0, h),
                     Some("start") => (x, x + wide, w),
                     Some("end") => (x - wide, x, w),
@@ -193,11 +194,60 @@ mod tests {
             .columns(2)
     }
 
+    /// The letters of a drawing's texts, whatever lines they are in.
+    fn letters(svg: &str) -> String {
+        let texts = svg.split("<text ").skip(1);
+        let texts = texts.filter_map(|tag| tag.split_once('>')?.1.split('<').next());
+        texts.flat_map(str::chars).filter(|c| *c != ' ').collect()
+    }
+
+    fn assert_whole(svg: &str, labels: &[&str]) {
+        for label in labels {
+            let all = letters(svg);
+            assert!(
+                all.contains(&svg::set(label).replace(' ', "")),
+                "{label} in {all}"
+            );
+        }
+        assert!(!svg.contains('\u{2026}'));
+    }
+
+    /// Bars over names: as many lines as they need, or turned.
+    #[test]
+    fn no_name_at_an_axis_is_shortened() {
+        let bands = ["0\u{2013}1", "80\u{2013}160", "500\u{2013}1600"].repeat(3);
+        let runs = ["20261122T143420Z-a-run-with-a-name"; 30];
+        let few = [
+            "the model as it was before",
+            "the same with a delay",
+            "floor",
+        ];
+        for names in [&bands[..], &runs[..], &few[..]] {
+            let at: Vec<f64> = (0..names.len()).map(|n| n as f64).collect();
+            let axis = Axis::categories("frequency band (Hz) of all the records together", names);
+            let panel = Panel::new(axis, Axis::linear("error", "nm RMS"))
+                .series(Series::bars("before", &at, &at, 0.4));
+            for width_px in [WIDTH_PX, SLIM_PX] {
+                let svg = figure(&Figure::new("f", "c").panel(panel.clone()), false, width_px);
+                assert_whole(&svg, names);
+                assert_eq!(clipped(&svg), Vec::<String>::new(), "{width_px} px");
+            }
+        }
+    }
+
     #[test]
     fn no_label_is_cut_off_wide_or_narrow_whatever_its_length() {
         for width_px in [WIDTH_PX, SLIM_PX] {
             let svg = figure(&long_words(), false, width_px);
             assert_eq!(clipped(&svg), Vec::<String>::new(), "{width_px} px");
+            let labels = [
+                "A title that is longer than a narrow screen is wide, about what is below it",
+                "a marker with a label that is far too long for a narrow panel",
+                "upper limit of the displacement that the board may command",
+                "length at the start of the cycle (um)",
+                "means of ten cycles with their 95 % intervals",
+            ];
+            assert_whole(&svg, &labels);
         }
         let names = ["20261122T143420Z-a-run-with-a-long-name-that-goes-on", "b"];
         let map = HeatMap::new(
@@ -208,6 +258,7 @@ mod tests {
         );
         let svg = figure(&Figure::heat_map("map", "c", map), false, WIDTH_PX);
         assert_eq!(clipped(&svg), Vec::<String>::new());
+        assert_whole(&svg, &names);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The elements of a figure, before it becomes SVG or PDF.
 
 use crate::picture::base64;
-use crate::svg::{px, set};
+use crate::svg::{LINE_PX, lines, px, set};
 use crate::tile::Tile;
 use std::fmt::Write;
 
@@ -108,12 +108,41 @@ impl Drawing {
         }
     }
 
-    /// A text that reads upwards, centred on `at`.
-    pub(crate) fn upright(&mut self, class: &str, at: (f64, f64), text: &str) {
+    /// A text in lines of at most a width, the last of them at `at`; returns their height.
+    pub(crate) fn lines_up(
+        &mut self,
+        class: &str,
+        (x, y): (f64, f64),
+        anchor: Anchor,
+        text: &str,
+        width_px: f64,
+    ) -> f64 {
+        let height = LINE_PX * lines(text, width_px).len() as f64;
+        self.lines_down(class, (x, y + LINE_PX - height), anchor, text, width_px)
+    }
+
+    /// A text in lines of at most a width, the first of them at `at`; returns their height.
+    pub(crate) fn lines_down(
+        &mut self,
+        class: &str,
+        (x, y): (f64, f64),
+        anchor: Anchor,
+        text: &str,
+        width_px: f64,
+    ) -> f64 {
+        let lines = lines(text, width_px);
+        for (n, line) in lines.iter().enumerate() {
+            self.text(class, (x, y + LINE_PX * n as f64), anchor, line);
+        }
+        LINE_PX * lines.len() as f64
+    }
+
+    /// A text that reads upwards.
+    pub(crate) fn upright(&mut self, class: &str, at: (f64, f64), anchor: Anchor, text: &str) {
         self.shapes.push(Shape::Text {
             class: class.to_owned(),
             at,
-            anchor: Anchor::Middle,
+            anchor,
             upright: true,
             text: text.to_owned(),
         });

@@ -2,7 +2,7 @@
 
 use crate::drawing::{Anchor, Drawing, Shape};
 use crate::figure::HeatMap;
-use crate::svg::{self, WIDTH_PX};
+use crate::svg::{self, LINE_PX, WIDTH_PX};
 
 /// Draws a heat map with its colour bar and returns the height.
 pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
@@ -14,26 +14,22 @@ pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
     let left = (widest + 16.0).min(WIDTH_PX / 3.0);
     let count = map.columns.len().max(1) as f64;
     let cell_w = ((WIDTH_PX - left - 90.0) / count).min(110.0);
-    let cell_h = 26.0;
-    let top = 30.0;
+    let most = |names: &[String], room: f64| {
+        let lines = names.iter().map(|name| svg::lines(name, room).len());
+        lines.max().unwrap_or(1) as f64 * LINE_PX
+    };
+    let cell_h = most(&map.rows, left - 10.0) + 11.0;
+    let top = most(&map.columns, cell_w - 2.0) + 15.0;
     let (low, high) = heat_range(map);
     for (column, name) in map.columns.iter().enumerate() {
         let x = left + (column as f64 + 0.5) * cell_w;
-        drawing.text(
-            "",
-            (x, top - 9.0),
-            Anchor::Middle,
-            &svg::fit(name, cell_w - 2.0),
-        );
+        drawing.lines_up("", (x, top - 9.0), Anchor::Middle, name, cell_w - 2.0);
     }
     for (row, name) in map.rows.iter().enumerate() {
         let y = top + row as f64 * cell_h;
-        drawing.text(
-            "",
-            (left - 8.0, y + cell_h / 2.0 + 4.0),
-            Anchor::End,
-            &svg::fit(name, left - 10.0),
-        );
+        let high = LINE_PX * svg::lines(name, left - 10.0).len() as f64;
+        let at = (left - 8.0, y + (cell_h - high) / 2.0 + 11.5);
+        drawing.lines_down("", at, Anchor::End, name, left - 10.0);
         for column in 0..map.columns.len() {
             let x = left + column as f64 * cell_w;
             let Some(value) = map.value(row, column) else {
@@ -75,13 +71,10 @@ pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
         Anchor::End,
         &number(high),
     );
-    drawing.text(
-        "",
-        (left + bar_w + 12.0, bar_y + 10.0),
-        Anchor::Start,
-        &svg::fit(&map.label, WIDTH_PX - left - bar_w - 16.0),
-    );
-    bar_y + 34.0
+    let at = (left + bar_w + 12.0, bar_y + 10.0);
+    let room = WIDTH_PX - left - bar_w - 16.0;
+    let high = drawing.lines_down("", at, Anchor::Start, &map.label, room);
+    bar_y + high.max(30.0) + 4.0
 }
 
 /// Ends of the colours: symmetric about zero when the values have both signs.

@@ -1,7 +1,7 @@
 //! Pictures side by side in rows and columns, with a scale bar.
 
 use crate::drawing::{Anchor, Drawing, Shape};
-use crate::svg::{self, px};
+use crate::svg::{self, LINE_PX, px};
 use crate::tile::Tile;
 
 /// Pictures in rows and columns.
@@ -47,7 +47,7 @@ const LARGEST_PIXEL: f64 = 3.0;
 /// Draws the pictures with their names and the scale bar, and returns the height.
 pub(crate) fn mosaic(drawing: &mut Drawing, mosaic: &Mosaic, width_px: f64) -> f64 {
     let widest = (mosaic.rows.iter().map(|name| svg::text_width_px(name))).fold(20.0, f64::max);
-    let (left, top) = ((widest + 12.0).min(width_px / 3.0), 24.0);
+    let left = (widest + 12.0).min(width_px / 3.0);
     let size = |of: fn(&Tile) -> u32| {
         let sizes = mosaic.tiles.iter().flatten().map(of);
         f64::from(sizes.max().unwrap_or(1))
@@ -57,16 +57,20 @@ pub(crate) fn mosaic(drawing: &mut Drawing, mosaic: &Mosaic, width_px: f64) -> f
     let pixel_px = (((width_px - left) / count - GAP) / wide).min(LARGEST_PIXEL);
     let (wide, high) = (wide * pixel_px, high * pixel_px);
     let across = |column: usize| left + column as f64 * (wide + GAP);
+    let most = (mosaic.columns.iter())
+        .map(|name| svg::lines(name, wide).len())
+        .max()
+        .unwrap_or(1);
+    let top = 9.0 + LINE_PX * most as f64;
     for (column, name) in mosaic.columns.iter().enumerate() {
-        let name = svg::fit(name, wide);
         let middle = across(column) + wide / 2.0;
-        drawing.text("", (middle, top - 8.0), Anchor::Middle, &name);
+        drawing.lines_up("", (middle, top - 8.0), Anchor::Middle, name, wide);
     }
     for (row, name) in mosaic.rows.iter().enumerate() {
         let y = top + row as f64 * (high + GAP);
-        let name = svg::fit(name, left - 10.0);
-        let at = (left - 8.0, y + high / 2.0 + 4.0);
-        drawing.text("", at, Anchor::End, &name);
+        let tall = LINE_PX * svg::lines(name, left - 10.0).len() as f64;
+        let at = (left - 8.0, y + (high - tall) / 2.0 + 11.5);
+        drawing.lines_down("", at, Anchor::End, name, left - 10.0);
         for column in 0..mosaic.columns.len() {
             let at = (across(column), y);
             match mosaic.tile(row, column) {

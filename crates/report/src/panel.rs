@@ -5,13 +5,14 @@ use crate::drawing::{Anchor, Drawing, Shape};
 use crate::figure::Panel;
 use crate::marks::{dot, draw_series};
 use crate::series::{Kind, Series};
-use crate::svg::{self, PALETTE};
+use crate::svg::{self, LINE_PX, PALETTE};
 
 /// Room for the numbers and the title of the y axis, px.
 pub(crate) const LEFT_PX: f64 = 82.0;
 /// Room to the right of the axes, px.
 pub(crate) const RIGHT_PX: f64 = 16.0;
-const LINE_PX: f64 = 18.0;
+/// Height of a line of title or legend, px.
+const HEAD_LINE_PX: f64 = 18.0;
 /// Least distance of the numbers at the y axis, px.
 const Y_SPACING_PX: f64 = 34.0;
 
@@ -137,27 +138,33 @@ pub(crate) fn left_px(panel: &Panel) -> f64 {
     let ticks = placed_y(panel).ticks(Y_SPACING_PX);
     let labels = ticks.iter().filter_map(|tick| tick.label.as_deref());
     let widest = labels.map(svg::text_width_px).fold(0.0, f64::max);
-    LEFT_PX.max(widest + AROUND_PX)
+    LEFT_PX.max(widest + AROUND_PX) + LINE_PX * (y_title(panel).len() - 1) as f64
+}
+
+/// The title of a panel's y axis in lines.
+fn y_title(panel: &Panel) -> Vec<String> {
+    svg::lines(&panel.y.title(), panel.height_px + 20.0)
 }
 
 /// Height of title and legend of a panel, px.
 pub(crate) fn head_px(panel: &Panel, told: &[Entry<'_>], width: f64) -> f64 {
-    let title = if panel.title.is_empty() { 0.0 } else { LINE_PX };
-    title + legend(&mut Drawing::default(), panel, told, (0.0, 0.0), width)
+    title_px(panel, width) + legend(&mut Drawing::default(), panel, told, (0.0, 0.0), width)
+}
+
+/// Height of the title of a panel, px.
+fn title_px(panel: &Panel, width: f64) -> f64 {
+    match panel.title.as_str() {
+        "" => 0.0,
+        title => HEAD_LINE_PX + LINE_PX * (svg::lines(title, width).len() - 1) as f64,
+    }
 }
 
 /// Draws one panel and returns its height with title, legend and axis texts.
 pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>) -> f64 {
     let mut top = frame.top;
-    if !panel.title.is_empty() {
-        drawing.text(
-            "ttl",
-            (frame.left, top + 13.0),
-            Anchor::Start,
-            &svg::fit(&panel.title, frame.width),
-        );
-        top += LINE_PX;
-    }
+    let at = (frame.left, top + 13.0);
+    drawing.lines_down("ttl", at, Anchor::Start, &panel.title, frame.width);
+    top += title_px(panel, frame.width);
     top += legend(drawing, panel, frame.told, (frame.left, top), frame.width);
     top = top.max(frame.top + frame.head_px) + 4.0;
 
@@ -183,7 +190,7 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
         width,
         height,
     };
-    grid(drawing, panel, frame, &area, &x, &y);
+    let numbers_px = grid(drawing, panel, frame, &area, &x, &y);
 
     drawing.shapes.push(Shape::Enter {
         at: (left, top),
@@ -212,19 +219,14 @@ pub(crate) fn draw_panel(drawing: &mut Drawing, panel: &Panel, frame: &Frame<'_>
 
     let mut end = bottom + 10.0;
     if frame.show_x {
-        drawing.text(
-            "",
-            (left + width / 2.0, bottom + 33.0),
-            Anchor::Middle,
-            &panel.x.title(),
-        );
-        end = bottom + 44.0;
+        let at = (left + width / 2.0, bottom + numbers_px + 18.0);
+        let high = drawing.lines_down("", at, Anchor::Middle, &panel.x.title(), width + RIGHT_PX);
+        end = bottom + numbers_px + high + 14.0;
     }
-    drawing.upright(
-        "",
-        (left - frame.left_px + 16.0, top + height / 2.0),
-        &svg::fit(&panel.y.title(), height + 20.0),
-    );
+    for (n, line) in y_title(panel).iter().enumerate() {
+        let x = left - frame.left_px + 16.0 + LINE_PX * n as f64;
+        drawing.upright("", (x, top + height / 2.0), Anchor::Middle, line);
+    }
     end - frame.top
 }
 
@@ -236,7 +238,7 @@ struct Area {
     height: f64,
 }
 
-/// Grid lines and the numbers at them.
+/// Draws grid lines and the numbers or names at them; returns the height of those at the x axis.
 fn grid(
     drawing: &mut Drawing,
     panel: &Panel,
@@ -244,7 +246,7 @@ fn grid(
     area: &Area,
     x: &Placed,
     y: &Placed,
-) {
+) -> f64 {
     let Area {
         left,
         top,
@@ -252,22 +254,34 @@ fn grid(
         height,
     } = *area;
     let bottom = top + height;
-    for tick in x.ticks(if frame.width < 320.0 { 52.0 } else { 72.0 }) {
+    let mut numbers_px = LINE_PX;
+    let room = match &panel.x.scale {
+        Scale::Categories(_) => x.at(1.0).unwrap_or(width) - x.at(0.0).unwrap_or(0.0) - 4.0,
+        _ => f64::INFINITY,
+    };
+    let ticks = x.ticks(if frame.width < 320.0 { 52.0 } else { 72.0 });
+    // Names with a part too wide for their place are turned, all of them.
+    let labels = ticks.iter().filter_map(|tick| tick.label.as_deref());
+    let turned = labels.map(svg::part_width_px).any(|wide| wide > room);
+    for tick in ticks {
         let Some(at) = x.at(tick.value) else { continue };
         let class = if tick.label.is_some() { "grd" } else { "grm" };
         if panel.x.scale == Scale::Linear || panel.x.scale == Scale::Log {
             drawing.line(class, (left + at, top), (left + at, bottom));
         }
-        if let (true, Some(label)) = (frame.show_x, &tick.label) {
-            let room = match &panel.x.scale {
-                Scale::Categories(names) => width / names.len().max(1) as f64,
-                _ => f64::INFINITY,
-            };
-            let label = svg::fit(label, room);
+        let (true, Some(label)) = (frame.show_x, &tick.label) else {
+            continue;
+        };
+        if turned {
+            let at = (left + at + 4.0, bottom + 6.0);
+            drawing.upright("mut", at, Anchor::End, label);
+            numbers_px = numbers_px.max(svg::text_width_px(label) + 6.0);
+        } else {
             // Long numbers at the end of an axis stay within the figure.
-            let half = svg::text_width_px(&label) / 2.0;
+            let half = svg::text_width_px(label).min(room) / 2.0;
             let at = (left + at).min(left + width + RIGHT_PX - half);
-            drawing.text("mut", (at, bottom + 15.0), Anchor::Middle, &label);
+            let at = (at, bottom + 15.0);
+            numbers_px = numbers_px.max(drawing.lines_down("mut", at, Anchor::Middle, label, room));
         }
     }
     for tick in y.ticks(Y_SPACING_PX) {
@@ -278,6 +292,7 @@ fn grid(
             drawing.text("mut", (left - 7.0, bottom - at + 4.0), Anchor::End, label);
         }
     }
+    numbers_px
 }
 
 /// Marker lines across the data, in its own coordinates.
@@ -298,21 +313,24 @@ fn draw_markers(
             let wide = svg::text_width_px(&marker.label);
             let (before, behind) = (at - 8.0, width - at - 8.0);
             if wide <= behind || behind >= before {
-                let label = svg::fit(&marker.label, behind);
-                drawing.text("mut", (at + 4.0, 13.0), Anchor::Start, &label);
+                let at = (at + 4.0, 13.0);
+                drawing.lines_down("mut", at, Anchor::Start, &marker.label, behind);
             } else {
-                let label = svg::fit(&marker.label, before);
-                drawing.text("mut", (at - 4.0, 13.0), Anchor::End, &label);
+                let at = (at - 4.0, 13.0);
+                drawing.lines_down("mut", at, Anchor::End, &marker.label, before);
             }
         } else {
             drawing.line("mrk", (0.0, height - at), (width, height - at));
-            let y_text = if height - at < 16.0 {
-                height - at + 13.0
+            let (label, room) = (&marker.label, width - 10.0);
+            let high = LINE_PX * svg::lines(label, room).len() as f64;
+            let below = height - at < high + 1.0;
+            let at = if below { height - at + 13.0 } else { height - at - 4.0 };
+            let at = (width - 5.0, at);
+            if below {
+                drawing.lines_down("mut", at, Anchor::End, label, room);
             } else {
-                height - at - 4.0
-            };
-            let label = svg::fit(&marker.label, width - 10.0);
-            drawing.text("mut", (width - 5.0, y_text), Anchor::End, &label);
+                drawing.lines_up("mut", at, Anchor::End, label, room);
+            }
         }
     }
 }
@@ -375,12 +393,14 @@ pub(crate) fn legend(
         return 0.0;
     }
     let (mut x, mut y) = (left, top);
+    let mut line_px = HEAD_LINE_PX;
     for (series, color) in named {
-        let label = svg::fit(&series.label, width - 30.0);
-        let wide = svg::text_width_px(&label) + 42.0;
+        let (label, room) = (&series.label, width - 30.0);
+        let wide = svg::text_width_px(label).min(room) + 42.0;
         if x > left && x + wide - 16.0 > left + width {
             x = left;
-            y += LINE_PX;
+            y += line_px;
+            line_px = HEAD_LINE_PX;
         }
         let middle = y + 9.0;
         match &series.kind {
@@ -404,8 +424,10 @@ pub(crate) fn legend(
                 );
             }
         }
-        drawing.text("", (x + 25.0, middle + 4.0), Anchor::Start, &label);
+        let at = (x + 25.0, middle + 4.0);
+        let high = drawing.lines_down("", at, Anchor::Start, label, room);
+        line_px = line_px.max(HEAD_LINE_PX + high - LINE_PX);
         x += wide;
     }
-    y - top + LINE_PX
+    y - top + line_px
 }

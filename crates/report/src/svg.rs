@@ -104,21 +104,39 @@ pub(crate) fn text_width_px(text: &str) -> f64 {
         .sum()
 }
 
-/// Cuts a text to a width with an ellipsis.
-pub(crate) fn fit(text: &str, width_px: f64) -> String {
-    if text_width_px(text) <= width_px {
-        return text.to_owned();
-    }
-    let mut out = String::new();
-    for c in text.chars() {
-        out.push(c);
-        if text_width_px(&out) + 8.0 > width_px {
-            out.pop();
-            break;
+/// Distance of the lines of one text, px.
+pub(crate) const LINE_PX: f64 = 15.0;
+
+/// The parts of a text between which a line may end: each with the spaces, or the hyphen, that end it.
+fn parts(text: &str) -> impl Iterator<Item = &str> {
+    text.split_inclusive([' ', '-', '\u{2013}', '/', '_'])
+}
+
+/// Width of the widest part of a text that stays in one line, px.
+pub(crate) fn part_width_px(text: &str) -> f64 {
+    let widths = parts(text).map(|part| text_width_px(part.trim_end()));
+    widths.fold(0.0, f64::max)
+}
+
+/// A text in lines of at most a width; nothing of it is left out. A part wider than that is broken anywhere.
+pub(crate) fn lines(text: &str, width_px: f64) -> Vec<String> {
+    let fits = |line: &str| text_width_px(line.trim_end()) <= width_px;
+    let mut lines = vec![String::new()];
+    let mut put = |piece: &str| match lines.last_mut() {
+        Some(line) if line.is_empty() || fits(&format!("{line}{piece}")) => line.push_str(piece),
+        _ => lines.push(piece.to_owned()),
+    };
+    for part in parts(text) {
+        if fits(part) {
+            put(part);
+        } else {
+            part.split_inclusive(|_| true).for_each(&mut put);
         }
     }
-    out.push('\u{2026}');
-    out
+    lines
+        .iter()
+        .map(|line| line.trim_end().to_owned())
+        .collect()
 }
 
 #[cfg(test)]
@@ -143,9 +161,22 @@ mod tests {
     }
 
     #[test]
-    fn long_texts_are_cut_with_an_ellipsis() {
-        let cut = fit("a rather long label that cannot fit", 60.0);
-        assert!(cut.ends_with('\u{2026}') && text_width_px(&cut) <= 68.0);
-        assert_eq!(fit("short", 60.0), "short");
+    fn a_long_text_takes_more_lines_and_loses_nothing() {
+        for text in [
+            "a rather long label that cannot fit",
+            "80\u{2013}160",
+            "20261122T143420Z-a-run",
+            "short",
+            "",
+        ] {
+            for width in [5.0, 30.0, 60.0, 400.0] {
+                let set = lines(text, width);
+                let all = set.concat().replace(' ', "");
+                assert_eq!(all, text.replace(' ', ""), "{width} px: {set:?}");
+                let widest = set.iter().map(|l| text_width_px(l)).fold(0.0, f64::max);
+                assert!(widest <= width.max(10.5), "{width} px: {set:?}");
+            }
+        }
+        assert_eq!(lines("80\u{2013}160", 40.0), ["80\u{2013}", "160"]);
     }
 }

@@ -5,6 +5,8 @@ const PICTURE_HEAD = 40;
 // Time over which the running RMS of the error is taken, s: long against the loop's own memory (1/6T, some 15 ms), short against a
 // disturbance that an operator looks for.
 export const RMS_S = 0.25;
+// A request without an answer for this long goes another way, ms: some ten times what the program takes on a busy machine.
+const ANSWER_MS = 1000;
 const word = new URLSearchParams(location.search).get("word") ?? "";
 export const wordOfLink = word;
 
@@ -102,7 +104,7 @@ export class Wire {
   constructor(handlers) {
     this.handlers = handlers;
     this.wait = 250;
-    this.asked = []; // where the answers to what was asked are to be shown, in order
+    this.asked = []; // what was asked by the line and is not answered yet, in order
     this.connect();
   }
   connect() {
@@ -113,7 +115,7 @@ export class Wire {
       if (typeof message.data === "string") {
         const told = JSON.parse(message.data);
         const answer = told.refused ?? (told.done ? "" : undefined);
-        if (answer !== undefined) this.handlers.answered(answer, this.asked.shift());
+        if (answer !== undefined) this.handlers.answered(answer, this.asked.shift()?.where);
         else this.handlers.told(told);
       } else {
         const view = new DataView(message.data);
@@ -122,7 +124,8 @@ export class Wire {
       }
     };
     socket.onclose = () => {
-      for (const where of this.asked.splice(0)) this.handlers.answered("The line broke before the answer came.", where);
+      const open = this.asked.splice(0);
+      for (const request of open) if (!this.again(request, open)) this.handlers.answered("The line broke before the answer came.", request.where);
       // After its last word a program is not looked for any more.
       if (this.handlers.closed()) return;
       setTimeout(() => this.connect(), this.wait);
@@ -130,11 +133,22 @@ export class Wire {
     };
     this.socket = socket;
   }
-  // A request goes by the line; where that is down, by a request of its own, so that a stop key always works. Its answer comes to
-  // `where`: empty if it was done.
-  ask(request, where) {
-    const text = JSON.stringify(request);
-    if (this.socket.readyState === WebSocket.OPEN) { this.asked.push(where); this.socket.send(text); return; }
+  // A request goes by the line; where that is down, by a request of its own. Its answer comes to `where`: empty if it was done.
+  ask({ do: what, ...more }, where) {
+    const request = { what, text: JSON.stringify({ do: what, ...more }), where };
+    if (this.socket.readyState !== WebSocket.OPEN) { this.post(request); return; }
+    this.asked.push(request);
+    this.socket.send(request.text);
+    setTimeout(() => { if (this.asked.includes(request)) this.again(request, this.asked); }, ANSWER_MS);
+  }
+  // A stop that may have been lost with the line goes by a request of its own: whether it has. A second stop changes nothing; but
+  // one that was withdrawn since, as a freeze is by going on, is not said again.
+  again(request, open) {
+    const stops = request.what === "park" || (["freeze", "pause"].includes(request.what) && request === open[open.length - 1]);
+    if (stops && !request.again) { request.again = true; this.post(request); }
+    return stops;
+  }
+  post({ text, where }) {
     fetch(`/do?word=${encodeURIComponent(word)}`, { method: "POST", body: text })
       .then(async answer => this.handlers.answered(answer.ok ? "" : await answer.text(), where))
       .catch(() => this.handlers.answered("The program does not answer. Without it the board parks the PZT.", where));

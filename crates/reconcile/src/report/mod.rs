@@ -3,7 +3,7 @@
 mod answer;
 
 use crate::units::figure;
-use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, band_labels};
+use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::result::Reconciliation;
 use cellpos_report::{Axis, Column, Emphasis, Figure, HeatMap, Panel, Report, Series, Table};
 
@@ -180,15 +180,21 @@ fn numbers(r: &mut Report, result: &Reconciliation) {
     r.table(t);
 }
 
+/// A band by its edges in Hz, to three digits.
+fn band_name(low_hz: f64, high_hz: f64) -> String {
+    let [low, high] = [low_hz, high_hz].map(|hz| figure(hz).parse().unwrap_or(hz));
+    format!("{low}\u{2013}{high}")
+}
+
 fn heat(r: &mut Report, name: &str, caption: &str, map: &DiscrepancyMap) {
-    let n = BAND_EDGES_HZ.len();
+    let n = map.edges_hz.len();
     let rows: Vec<&crate::verdict::map::MapRow> =
         map.rows.iter().filter(|row| row.cells.len() == n).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.name.as_str()).collect();
-    let bands: Vec<String> = band_labels()
-        .iter()
-        .map(|label| label.trim_end_matches(" Hz").replace("..", "\u{2013}"))
+    let mut bands: Vec<String> = (map.edges_hz.windows(2))
+        .map(|edge| band_name(edge[0], edge[1]))
         .collect();
+    bands.push("all".to_owned());
     let caption = &format!("{caption}; by record and band (Hz)");
     let values: Vec<f64> = rows
         .iter()
@@ -354,7 +360,7 @@ fn innovations(r: &mut Report, result: &Reconciliation) {
     let (factor, unit) = fine(result);
     let whole_hz = g.bands.last().map_or(1.0, |band| band.high_hz);
     let names: Vec<String> = (g.bands.iter())
-        .map(|band| format!("{}\u{2013}{}", band.low_hz, band.high_hz))
+        .map(|band| band_name(band.low_hz, band.high_hz))
         .collect();
     let at = |side: f64| {
         (0..names.len())
@@ -398,11 +404,37 @@ fn innovations(r: &mut Report, result: &Reconciliation) {
     );
 }
 
+/// The residual that noise alone leaves to a free run of a right model, over the length of the traces.
+fn free_run_noise(result: &Reconciliation) -> String {
+    let shown = (result.traces.0.iter())
+        .map(|trace| trace.time_s.len())
+        .max()
+        .unwrap_or(0);
+    let end_s = shown as f64 * result.sample_s;
+    let noise = &result.noise;
+    let walk = (noise.walk_um2 * shown as f64).sqrt();
+    let still = noise.white_um2 + noise.coloured.map_or(0.0, |c| c.variance_um2);
+    let mut text = format!(
+        "Free runs of both models from the start of each record. Noise alone leaves a right model a residual of {} RMS",
+        small(result, still.max(0.0).sqrt())
+    );
+    // Brownian motion adds up on a plant that integrates. Below the noise of single rows it cannot be seen.
+    if walk * walk > still {
+        text += &format!(
+            " from sample to sample, and a Brownian path that is some {} away after {} s",
+            small(result, walk),
+            figure(end_s)
+        );
+    }
+    if noise.zero_flow.is_some() {
+        text += "; what the zero flow moves adds up, too";
+    }
+    text + "."
+}
+
 fn traces(r: &mut Report, result: &Reconciliation) {
     r.section("Traces");
-    r.paragraph(
-        "Free runs of both models from the start of each record. A perfect model's residual wanders like a Brownian path.",
-    );
+    r.paragraph(&free_run_noise(result));
     let unit = &result.gap.unit;
     for t in &result.traces.0 {
         r.figure(

@@ -194,7 +194,7 @@ fn gap(
         quantity: "RMS innovation on held-out records",
         steps: gap_steps(ctx, null, steps, rms),
         per_record: held.per_record.clone(),
-        bands: held_out::bands(null_map, after_map, 0.5 / ctx.problem.base.sample_s),
+        bands: held_out::bands(null_map, after_map),
     }
 }
 

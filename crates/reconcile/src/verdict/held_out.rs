@@ -4,7 +4,7 @@
 use crate::fit::context::{Context, Fit};
 use crate::problem::{Mask, Prepared, split_from_the_end, split_in_time};
 use crate::thresholds::THRESHOLDS;
-use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap};
+use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::result::{BandGap, Interval, RecordGap};
 
 /// What the held-out check found.
@@ -273,29 +273,23 @@ fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
 }
 
 /// RMS innovation per band before and after, all records together.
-pub(crate) fn bands(
-    before: &DiscrepancyMap,
-    after: &DiscrepancyMap,
-    nyquist_hz: f64,
-) -> Vec<BandGap> {
-    let n = BAND_EDGES_HZ.len() - 1;
-    // Records have no frequency above half their rate.
-    (0..n)
-        .filter(|b| BAND_EDGES_HZ[*b] < nyquist_hz)
-        .map(|b| {
+pub(crate) fn bands(before: &DiscrepancyMap, after: &DiscrepancyMap) -> Vec<BandGap> {
+    let edges = &before.edges_hz;
+    (edges.windows(2).enumerate())
+        .map(|(b, edge)| {
             let rms = |m: &DiscrepancyMap| {
                 let cells: Vec<f64> = m
                     .rows
                     .iter()
-                    .filter(|r| r.cells.len() > n)
+                    .filter(|r| r.cells.len() == edges.len())
                     .map(|r| r.cells[b].rms_um.powi(2))
                     .collect();
                 (cells.iter().sum::<f64>() / cells.len().max(1) as f64).sqrt()
             };
             let floor = before.rows.first().map_or(0.0, |r| r.cells[b].floor_um);
             BandGap {
-                low_hz: BAND_EDGES_HZ[b],
-                high_hz: BAND_EDGES_HZ[b + 1].min(nyquist_hz),
+                low_hz: edge[0],
+                high_hz: edge[1],
                 before: rms(before),
                 after: rms(after),
                 floor,
@@ -307,30 +301,35 @@ pub(crate) fn bands(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::verdict::map::{Cell, MapRow};
+    use crate::verdict::map::{Cell, MapRow, band_edges_hz};
 
-    /// White noise of one unit at 200 Hz: the parts of its bands add up to the whole.
+    /// White noise of one unit, from slow records to those of a fast camera: the parts of the bands add up to the whole.
     #[test]
     fn bands_end_at_half_the_rate_and_add_up() {
-        let cell = Cell {
-            rms_um: 1.0,
-            floor_um: 1.0,
-            z: 0.0,
-            flagged: false,
-        };
-        let row = MapRow {
-            name: "a".to_owned(),
-            cells: vec![cell; BAND_EDGES_HZ.len()],
-        };
-        let map = DiscrepancyMap {
-            rows: vec![row],
-            ratios: Vec::new(),
-        };
-        let found = bands(&map, &map, 100.0);
-        assert_eq!(found.last().map(|band| band.high_hz), Some(100.0));
-        let whole: f64 = (found.iter())
-            .map(|band| band.before.powi(2) * (band.high_hz - band.low_hz) / 100.0)
-            .sum();
-        assert!((whole - 1.0).abs() < 1e-12, "{whole}");
+        for rate_hz in [1.0, 200.0, 1000.0, 2000.0, 5000.0, 20_000.0] {
+            let cell = Cell {
+                rms_um: 1.0,
+                floor_um: 1.0,
+                z: 0.0,
+                flagged: false,
+            };
+            let edges_hz = band_edges_hz(1.0 / rate_hz);
+            let row = MapRow {
+                name: "a".to_owned(),
+                cells: vec![cell; edges_hz.len()],
+            };
+            let map = DiscrepancyMap {
+                edges_hz,
+                rows: vec![row],
+                ratios: Vec::new(),
+            };
+            let found = bands(&map, &map);
+            let half_rate = 0.5 * rate_hz;
+            assert_eq!(found.last().map(|band| band.high_hz), Some(half_rate));
+            let whole: f64 = (found.iter())
+                .map(|band| band.before.powi(2) * (band.high_hz - band.low_hz) / half_rate)
+                .sum();
+            assert!((whole - 1.0).abs() < 1e-12, "{rate_hz} Hz: {whole}");
+        }
     }
 }

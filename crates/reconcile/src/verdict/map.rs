@@ -5,8 +5,20 @@ use crate::thresholds::THRESHOLDS;
 use crate::verdict::response::{self, BandRatio, transform};
 use realfft::RealFftPlanner;
 
-/// Edges of the bands \[Hz\].
-pub const BAND_EDGES_HZ: [f64; 8] = [0.0, 1.0, 4.0, 15.0, 40.0, 80.0, 160.0, 500.0];
+/// Lower edges of the bands \[Hz\]. The last band of a record ends at half its rate, so the bands together hold all of its energy.
+const BAND_STARTS_HZ: [f64; 10] = [0.0, 1.0, 4.0, 15.0, 40.0, 80.0, 160.0, 500.0, 1600.0, 5000.0];
+
+/// Edges of the bands of records with a sample time in s \[Hz\]: one more than there are bands.
+pub(crate) fn band_edges_hz(sample_s: f64) -> Vec<f64> {
+    /// A narrower last band is part of the one below it: a rate of 1000.01 Hz has no band from 500 Hz on.
+    const LEAST_RATIO: f64 = 1.1;
+    let half_rate = 0.5 / sample_s;
+    let mut edges: Vec<f64> = (BAND_STARTS_HZ.into_iter())
+        .filter(|start| LEAST_RATIO * start < half_rate)
+        .collect();
+    edges.push(half_rate);
+    edges
+}
 
 /// One cell of the map.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
@@ -26,13 +38,15 @@ pub struct Cell {
 pub struct MapRow {
     /// Record or part.
     pub name: String,
-    /// One cell per band of [`BAND_EDGES_HZ`]; the last is the whole row.
+    /// One cell per band of the map; the last is the whole row.
     pub cells: Vec<Cell>,
 }
 
 /// The discrepancy map of a fit.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct DiscrepancyMap {
+    /// Edges of the bands, from 0 to half the rate of the records \[Hz\].
+    pub edges_hz: Vec<f64>,
     /// Records, then thirds of the time.
     pub rows: Vec<MapRow>,
     /// Response ratio per third-octave band, all records together.
@@ -44,16 +58,6 @@ impl DiscrepancyMap {
     pub fn any_flagged(&self) -> bool {
         self.rows.iter().any(|r| r.cells.iter().any(|c| c.flagged))
     }
-}
-
-/// Labels of the bands.
-pub fn band_labels() -> Vec<String> {
-    let mut labels: Vec<String> = BAND_EDGES_HZ
-        .windows(2)
-        .map(|w| format!("{}..{} Hz", w[0], w[1]))
-        .collect();
-    labels.push("all".to_owned());
-    labels
 }
 
 fn cell(energy: f64, n: f64, sigma_um: f64, slack: f64, limit: f64) -> Cell {
@@ -75,7 +79,8 @@ fn cell(energy: f64, n: f64, sigma_um: f64, slack: f64, limit: f64) -> Cell {
 pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     let sample_s = ctx.problem.base.sample_s;
     let sigma = ctx.problem.noise.innovation_um();
-    let bands = BAND_EDGES_HZ.len() - 1;
+    let edges_hz = band_edges_hz(sample_s);
+    let bands = edges_hz.len() - 1;
     let limit = THRESHOLDS.flag_sd;
     let mut planner = RealFftPlanner::<f64>::new();
     let mut rows = Vec::new();
@@ -87,10 +92,7 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
         let mut bins = vec![0.0; bands];
         for (k, x) in spectrum.iter().enumerate() {
             let hz = k as f64 / (n as f64 * sample_s);
-            let Some(b) = BAND_EDGES_HZ
-                .windows(2)
-                .position(|w| hz >= w[0] && hz < w[1])
-            else {
+            let Some(b) = edges_hz[..bands].iter().rposition(|start| hz >= *start) else {
                 continue;
             };
             let double = if k == 0 || 2 * k == n { 1.0 } else { 2.0 };
@@ -129,6 +131,7 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
         });
     }
     DiscrepancyMap {
+        edges_hz,
         rows,
         ratios: response::ratios(ctx, fit, &mut planner),
     }

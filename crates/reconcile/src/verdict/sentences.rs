@@ -4,7 +4,7 @@ use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;
 use crate::thresholds::THRESHOLDS;
 use crate::units::figure;
-use crate::verdict::map::{BAND_EDGES_HZ, DiscrepancyMap, MapRow};
+use crate::verdict::map::{DiscrepancyMap, MapRow};
 
 /// Sentences about where the null model fails.
 pub(crate) fn sentences(
@@ -36,8 +36,9 @@ pub(crate) fn sentences(
 
 /// At which frequencies, in which records.
 fn span(records: &[Prepared], map: &DiscrepancyMap, flagged: &[&MapRow]) -> String {
-    let bands = BAND_EDGES_HZ.len() - 1;
-    let mut hit = [false; BAND_EDGES_HZ.len() - 1];
+    let edges = &map.edges_hz;
+    let bands = edges.len() - 1;
+    let mut hit = vec![false; bands];
     for r in flagged {
         for (b, hit) in hit.iter_mut().enumerate() {
             *hit |= r.cells[b].flagged;
@@ -47,12 +48,12 @@ fn span(records: &[Prepared], map: &DiscrepancyMap, flagged: &[&MapRow]) -> Stri
     let last = hit.iter().rposition(|h| *h);
     let span = match (first, last) {
         (Some(0), Some(l)) if l + 1 == bands => "at all frequencies".to_owned(),
-        (Some(0), Some(l)) => format!("below {} Hz", BAND_EDGES_HZ[l + 1]),
-        (Some(f), Some(l)) if l + 1 == bands => format!("above {} Hz", BAND_EDGES_HZ[f]),
+        (Some(0), Some(l)) => format!("below {} Hz", edges[l + 1]),
+        (Some(f), Some(l)) if l + 1 == bands => format!("above {} Hz", edges[f]),
         (Some(f), Some(l)) => format!(
             "between {} and {} Hz",
-            BAND_EDGES_HZ[f],
-            BAND_EDGES_HZ[l + 1]
+            edges[f],
+            edges[l + 1]
         ),
         _ => "spread over all frequencies".to_owned(),
     };
@@ -186,7 +187,7 @@ fn largest(ctx: &Context<'_>, map: &DiscrepancyMap) -> Option<String> {
         .filter(|(r, _)| !r.rest)
         .map(|(r, m)| {
             let rms = (r.u.iter().map(|u| u * u).sum::<f64>() / r.u.len() as f64).sqrt();
-            let c = &m.cells[BAND_EDGES_HZ.len() - 1];
+            let c = &m.cells[map.edges_hz.len() - 1];
             (
                 (c.rms_um.powi(2) - c.floor_um.powi(2)).max(0.0).sqrt(),
                 rms,

@@ -165,3 +165,24 @@ fn the_picture_is_most_of_the_page_on_every_screen_and_every_theme() {
     }
     assert_eq!(page.console(), Vec::<String>::new());
 }
+
+/// A line that takes a stop and does not deliver it: one that is silent, and one that breaks.
+#[test]
+#[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
+fn a_stop_that_is_lost_with_the_line_goes_another_way() {
+    let (_folder, page, run) = start(PATIENT, "--duration 300s");
+    page.run("window.send = WebSocket.prototype.send; WebSocket.prototype.send = function () {};");
+    page.click("freeze");
+    page.wait_for(
+        "return document.body.dataset.state === 'frozen'",
+        programs::PATIENCE,
+    );
+    page.run("WebSocket.prototype.send = window.send");
+    page.click("resume");
+    page.wait_for(RUNNING, programs::PATIENCE);
+    page.run("WebSocket.prototype.send = function () { this.close(); };");
+    page.click("park");
+    run.ended();
+    let [_, word, reason, ..] = when_gone(&page);
+    assert_eq!(word, "stopped", "{reason}");
+}
