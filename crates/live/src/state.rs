@@ -19,8 +19,6 @@ pub struct Hello {
     pub view_um: [f64; 2],
     /// Budget of a tick, us.
     pub budget_us: f64,
-    /// Lowest possible RMS error of holding, nm, if the model gives it.
-    pub bound_nm: Option<f64>,
     /// Spectral density that the loop's linear model predicts for the measured error of a hold. Each entry has frequency in Hz, amplitude
     /// from Brownian motion in nm/sqrt(Hz), and amplitude per nm RMS of localisation noise. Empty without a prediction.
     pub predicted_spectrum: Vec<[f64; 3]>,
@@ -53,7 +51,6 @@ impl Default for Hello {
             slew_um_per_s: f64::NAN,
             view_um: [f64::NAN; 2],
             budget_us: f64::NAN,
-            bound_nm: None,
             predicted_spectrum: vec![],
             steered: false,
             by_hand: false,
@@ -122,6 +119,8 @@ pub struct State {
     pub rms_nm: Option<f64>,
     /// Localisation noise reported by vision, nm RMS.
     pub fix_noise_nm: Option<f64>,
+    /// Lowest possible RMS error of holding, nm, by Brownian motion, noise and delay of the run so far.
+    pub bound_nm: Option<f64>,
     /// Lateness of the ticks' wake-ups, us: the 99.9 % quantile.
     pub wake_us: Option<f64>,
     /// Computing time of the ticks, us, with the same percentile.

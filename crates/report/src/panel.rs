@@ -324,7 +324,11 @@ fn draw_markers(
             let (label, room) = (&marker.label, width - 10.0);
             let high = LINE_PX * svg::lines(label, room).len() as f64;
             let below = height - at < high + 1.0;
-            let at = if below { height - at + 13.0 } else { height - at - 4.0 };
+            let at = if below {
+                height - at + 13.0
+            } else {
+                height - at - 4.0
+            };
             let at = (width - 5.0, at);
             if below {
                 drawing.lines_down("mut", at, Anchor::End, label, room);

@@ -247,19 +247,51 @@ pub fn is_beaten(bound: f64, reached: f64, duration_s: f64) -> bool {
     reached < bound * (1.0 - unsure)
 }
 
+/// Figures of a run, over or not, that its lowest possible error depends on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Reached {
+    /// Localisation noise as vision states it, nm RMS.
+    pub(crate) fix_noise_nm: f64,
+    /// As in [`delay_of_run_s`].
+    pub(crate) loop_delay_ms: Option<f64>,
+    /// RMS of the true error, nm, if it is known.
+    pub(crate) rms_true_nm: Option<f64>,
+    /// RMS of the measured error, nm, if it is known.
+    pub(crate) rms_measured_nm: Option<f64>,
+    pub(crate) duration_s: f64,
+}
+
 /// Smallest RMS error that any controller could reach, nm: from the assumed Brownian motion and noise, with the delay that the run
 /// measured, not the configured one. `None` if the run did better: then the stated diffusion or noise is wrong, and the figure is not a
 /// bound.
 pub fn bound_rms_nm(file: &RigFile, setup: &Setup, summary: &Summary) -> Option<f64> {
-    let noise_nm = summary.fix_noise_nm?;
-    let used_ms = (summary.exposure_to_command_us.max > 0.0).then_some(summary.loop_delay_ms);
-    let delay_s = delay_of_run_s(setup, used_ms);
     let diffusion = crate::fit::diffusion_um2_per_s(file, &setup.model);
+    bound_of_run_nm(setup, diffusion, &Reached::of(summary)?)
+}
+
+impl Reached {
+    /// Of a run that is over; `None` without a position.
+    pub(crate) fn of(summary: &Summary) -> Option<Self> {
+        let used = summary.exposure_to_command_us.max > 0.0;
+        Some(Self {
+            fix_noise_nm: summary.fix_noise_nm?,
+            loop_delay_ms: used.then_some(summary.loop_delay_ms),
+            rms_true_nm: summary.rms_true_nm,
+            rms_measured_nm: summary.rms_measured_nm,
+            duration_s: summary.duration_s,
+        })
+    }
+}
+
+/// [`bound_rms_nm`] of the run's figures and the diffusion, um^2/s.
+pub(crate) fn bound_of_run_nm(setup: &Setup, diffusion: f64, run: &Reached) -> Option<f64> {
+    let noise_nm = run.fix_noise_nm;
+    let delay_s = delay_of_run_s(setup, run.loop_delay_ms);
     let bound_nm = 1e3 * bound_of_um(setup, diffusion, noise_nm * 1e-3, delay_s);
     let measured_nm = |nm: f64| (nm * nm - noise_nm * noise_nm).max(0.0).sqrt();
-    let reached_nm = (summary.rms_true_nm).or(summary.rms_measured_nm.map(measured_nm));
-    let beaten = reached_nm.is_some_and(|nm| is_beaten(bound_nm, nm, summary.duration_s));
-    (!beaten).then_some(bound_nm)
+    let reached_nm = (run.rms_true_nm).or(run.rms_measured_nm.map(measured_nm));
+    let beaten = reached_nm.is_some_and(|nm| is_beaten(bound_nm, nm, run.duration_s));
+    (!beaten && bound_nm.is_finite()).then_some(bound_nm)
 }
 
 /// Delay from an exposure to the command of a run, s: as the run measured it (`loop_delay_ms`, with half a period of hold in it), or, of

@@ -15,7 +15,7 @@ const $ = id => document.getElementById(id);
 let hello = null, operator = false, rows = new Rows(1024), traces = new Traces($("traces"), rows), lateness = new Lateness();
 let state = null, cycles = [], unheard = null;
 const picture = new PictureView($("picture"), $("inset")), clips = new Clips($), view = new TraceView($), sound = new Sound($("sound"));
-view.begin({ bound_nm: null }, rows, traces);
+view.begin({}, rows, traces);
 themes($("theme"));
 
 function begin(told) {
@@ -28,7 +28,6 @@ function begin(told) {
   view.begin(hello, rows, traces);
   document.title = `${hello.name} - cellpos`;
   $("name").textContent = hello.name; $("subtitle").textContent = hello.subtitle;
-  $("f-bound").textContent = hello.bound_nm === null ? "-" : `${hello.bound_nm.toFixed(1)} nm`;
   for (const id of ["freeze", "resume", "park"]) $(id).hidden = hello.recorded;
   for (const input of document.querySelectorAll("#target-form *, #note-form *")) input.disabled = !operator || hello.recorded;
   $("target-card").hidden = !hello.steered; $("script-card").hidden = !hello.script; $("note-card").hidden = !hello.notes;
@@ -85,6 +84,8 @@ function show(told) {
   if (word && !before?.last_word) sound.play(word.how === "done" || word.how === "stopped" ? "warning" : "fault");
   else if (!word && state.banner.state === "safe" && before?.banner.state !== "safe") sound.play("fault");
   buttons();
+  $("f-bound").textContent = state.bound_nm === null ? "-" : `${state.bound_nm.toFixed(1)} nm`;
+  traces.bound = state.bound_nm;
   // The counters below are those of the record up to this tick.
   document.body.dataset.ticks = state.ticks;
   $("f-time").textContent = clock(state.time_s);

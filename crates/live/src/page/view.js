@@ -19,7 +19,6 @@ export class TraceView {
   // Another run, or the same again.
   begin(hello, rows, traces) {
     Object.assign(this, { hello, rows, traces, held: null, mark: null, trigger: null, checked: 0 });
-    this.traces.bound = hello.bound_nm;
     this.traces.chosen = this.chosen();
     this.$("hold").setAttribute("aria-pressed", "false");
   }

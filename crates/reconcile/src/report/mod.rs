@@ -404,39 +404,41 @@ fn innovations(r: &mut Report, result: &Reconciliation) {
     );
 }
 
-/// The residual that noise alone leaves to a free run of a right model, over the length of the traces.
+/// The residual of a free run that is right: noise, and on a plant that integrates whatever it adds up.
 fn free_run_noise(result: &Reconciliation) -> String {
-    let shown = (result.traces.0.iter())
+    let shown = (result.traces.all.iter())
         .map(|trace| trace.time_s.len())
         .max()
         .unwrap_or(0);
-    let end_s = shown as f64 * result.sample_s;
     let noise = &result.noise;
     let walk = (noise.walk_um2 * shown as f64).sqrt();
     let still = noise.white_um2 + noise.coloured.map_or(0.0, |c| c.variance_um2);
-    let mut text = format!(
-        "Free runs of both models from the start of each record. Noise alone leaves a right model a residual of {} RMS",
-        small(result, still.max(0.0).sqrt())
-    );
-    // Brownian motion adds up on a plant that integrates. Below the noise of single rows it cannot be seen.
-    if walk * walk > still {
-        text += &format!(
-            " from sample to sample, and a Brownian path that is some {} away after {} s",
-            small(result, walk),
-            figure(end_s)
-        );
+    let still = still.max(0.0).sqrt();
+    let mut left = Vec::new();
+    if still > 1e-2 * walk {
+        left.push(format!("noise of {} RMS", small(result, still)));
     }
-    if noise.zero_flow.is_some() {
-        text += "; what the zero flow moves adds up, too";
+    if walk > still {
+        let end_s = figure(shown as f64 * result.sample_s);
+        let away = small(result, walk);
+        left.push(format!(
+            "a Brownian path, some {away} from its start after {end_s} s"
+        ));
     }
-    text + "."
+    if result.traces.ramp {
+        left.push("a ramp, because the plant integrates the error of the zero flow".to_owned());
+    }
+    format!(
+        "Free runs of both models from the start of each record. A right model still leaves {}.",
+        left.join(", and ")
+    )
 }
 
 fn traces(r: &mut Report, result: &Reconciliation) {
     r.section("Traces");
     r.paragraph(&free_run_noise(result));
     let unit = &result.gap.unit;
-    for t in &result.traces.0 {
+    for t in &result.traces.all {
         r.figure(
             Figure::new(
                 &format!("trace-{}", t.record),

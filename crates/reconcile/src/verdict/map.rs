@@ -6,7 +6,9 @@ use crate::verdict::response::{self, BandRatio, transform};
 use realfft::RealFftPlanner;
 
 /// Lower edges of the bands \[Hz\]. The last band of a record ends at half its rate, so the bands together hold all of its energy.
-const BAND_STARTS_HZ: [f64; 10] = [0.0, 1.0, 4.0, 15.0, 40.0, 80.0, 160.0, 500.0, 1600.0, 5000.0];
+const BAND_STARTS_HZ: [f64; 10] = [
+    0.0, 1.0, 4.0, 15.0, 40.0, 80.0, 160.0, 500.0, 1600.0, 5000.0,
+];
 
 /// Edges of the bands of records with a sample time in s \[Hz\]: one more than there are bands.
 pub(crate) fn band_edges_hz(sample_s: f64) -> Vec<f64> {

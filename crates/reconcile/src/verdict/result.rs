@@ -4,6 +4,7 @@ use crate::data::floor::FloorSource;
 use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
 use crate::verdict::battery::Hypothesis;
+use crate::verdict::held_out;
 use crate::verdict::map::DiscrepancyMap;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Definition;
@@ -202,15 +203,22 @@ pub struct Trace {
 
 /// All traces.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Traces(pub Vec<Trace>);
+pub struct Traces {
+    /// Record by record.
+    pub all: Vec<Trace>,
+    /// Whether a command that is off by a constant becomes a ramp: the plant integrates.
+    pub ramp: bool,
+}
 
 impl Traces {
     pub(crate) fn new(ctx: &Context<'_>, null: &Fit, fit: &Fit) -> Self {
         let sample_s = ctx.problem.base.sample_s;
         let (before, sim_before) = ctx.residual(null);
         let (after, sim_after) = ctx.residual(fit);
-        Self(
-            ctx.problem
+        Self {
+            ramp: held_out::integrates(ctx),
+            all: ctx
+                .problem
                 .records
                 .iter()
                 .enumerate()
@@ -239,7 +247,7 @@ impl Traces {
                     }
                 })
                 .collect(),
-        )
+        }
     }
 }
 

@@ -50,11 +50,7 @@ fn span(records: &[Prepared], map: &DiscrepancyMap, flagged: &[&MapRow]) -> Stri
         (Some(0), Some(l)) if l + 1 == bands => "at all frequencies".to_owned(),
         (Some(0), Some(l)) => format!("below {} Hz", edges[l + 1]),
         (Some(f), Some(l)) if l + 1 == bands => format!("above {} Hz", edges[f]),
-        (Some(f), Some(l)) => format!(
-            "between {} and {} Hz",
-            edges[f],
-            edges[l + 1]
-        ),
+        (Some(f), Some(l)) => format!("between {} and {} Hz", edges[f], edges[l + 1]),
         _ => "spread over all frequencies".to_owned(),
     };
     let names = if flagged.len() == records.len() {

@@ -42,7 +42,7 @@ impl Reconciliation {
                 out(&mut cell.floor_um);
             }
         }
-        for t in &mut self.traces.0 {
+        for t in &mut self.traces.all {
             let columns = [
                 &mut t.measured_um,
                 &mut t.before_um,

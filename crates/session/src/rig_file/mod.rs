@@ -5,6 +5,7 @@ mod connect;
 mod partner;
 mod port;
 mod sight;
+mod unused;
 
 pub use actuator::ActuatorConfig;
 pub use connect::Connected;
@@ -197,6 +198,10 @@ impl RigFile {
         };
         let mut file: Self = quantities::read(path)?;
         file.validate(path)?;
+        let text = std::fs::read_to_string(path).unwrap_or_default();
+        for said in file.unused(&text) {
+            tracing::warn!("{}:{said}", path.display());
+        }
         // Paths in the file start at the file's own folder.
         let folder = path.parent().unwrap_or(Path::new(""));
         if let Some(calibration) = &mut file.calibration_file {

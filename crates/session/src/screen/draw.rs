@@ -36,7 +36,7 @@ pub(super) fn screen(
     ])
     .areas(area);
     frame.render_widget(banner_line(history), banner);
-    frame.render_widget(fit(figure_parts(hello, history), figures.width), figures);
+    frame.render_widget(fit(figure_parts(history), figures.width), figures);
     frame.render_widget(gauge_line(hello, history, gauge.width), gauge);
     frame.render_widget(fit(script, doing.width), doing);
     if area.height >= ROWS_FOR_PZT {
@@ -94,7 +94,7 @@ fn fit(parts: Vec<(String, Style)>, columns: u16) -> Paragraph<'static> {
     Paragraph::new(Line::from(spans))
 }
 
-fn figure_parts(hello: &Hello, history: &History) -> Vec<(String, Style)> {
+fn figure_parts(history: &History) -> Vec<(String, Style)> {
     let state = &history.state;
     let (plain, quiet) = (Style::new(), Style::new().fg(Color::Gray));
     let alarm = |count: u64| {
@@ -115,7 +115,7 @@ fn figure_parts(hello: &Hello, history: &History) -> Vec<(String, Style)> {
     if let Some(rms_nm) = state.rms_nm {
         parts.push((format!("RMS {rms_nm:.1} nm"), plain.bold()));
     }
-    if let Some(bound_nm) = hello.bound_nm {
+    if let Some(bound_nm) = state.bound_nm {
         parts.push((format!("lowest {bound_nm:.1} nm"), quiet));
     }
     parts.push((format!("late {}", state.late), alarm(state.late)));

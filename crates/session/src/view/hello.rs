@@ -1,6 +1,5 @@
 //! Data of a run for the page before it begins.
 
-use crate::connect::bound_of_um;
 use crate::rig::Rig;
 use crate::setup::Setup;
 use cellpos_control::ADAPT_COLUMNS;
@@ -37,7 +36,6 @@ pub(super) fn hello(rig: &Rig, setup: &Setup, page: &Page) -> Hello {
 pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
     let limits = setup.controller.limits;
     let timing = &setup.config.timing;
-    let delay_s = timing.camera_delay_ms * 1e-3;
     Hello {
         name: page.name.clone(),
         subtitle: page.subtitle.clone(),
@@ -45,7 +43,6 @@ pub(super) fn hello_of(setup: &Setup, diffusion: f64, page: &Page) -> Hello {
         range_um: [limits.low_um, limits.high_um],
         slew_um_per_s: limits.slew_um_per_s,
         budget_us: timing.budget_us,
-        bound_nm: (diffusion > 0.0).then(|| 1e3 * bound_of_um(setup, diffusion, 0.0, delay_s)),
         predicted_spectrum: predicted_spectrum(setup, diffusion),
         adaptation_at: adaptation_at(setup),
         steered: page.steered,

@@ -3,6 +3,7 @@
 use super::hello::{Page, hello};
 use super::last_word;
 use super::pictures::Pictures;
+use super::possible::Possible;
 use super::served::{Server, ViewAddress, serve};
 use super::watcher::Watcher;
 use crate::clips;
@@ -59,6 +60,8 @@ impl View {
     /// The address cannot be used, or other machines could reach it although the user did not request that.
     pub fn of(wanted: &Wanted, rig: &mut Rig, setup: &Setup, page: &Page) -> Result<Self, Failure> {
         let mut view = Self::open(wanted, hello(rig, setup, page), rig.operator())?;
+        let diffusion = crate::fit::diffusion_um2_per_s(rig.file(), &setup.model);
+        view.watcher = (view.watcher).map(|it| it.with_possible(Possible::new(setup, diffusion)));
         view.follow(rig);
         Ok(view)
     }

@@ -10,6 +10,7 @@ mod hello;
 mod last_word;
 mod live_view;
 mod pictures;
+mod possible;
 mod served;
 mod tail;
 mod viewed;

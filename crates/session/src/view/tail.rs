@@ -31,13 +31,23 @@ impl Tail {
 
     /// The 99.9 % quantile of the times, us, at the upper end of its step; `None` before the first.
     pub(super) fn p999_us(&self) -> Option<f64> {
-        let above = self.count / 1000;
+        Some(upper_ns(self.exceeded_by(self.count / 1000)?) as f64 * 1e-3)
+    }
+
+    /// The median of the times, us, in the middle of its step; `None` before the first.
+    pub(super) fn median_us(&self) -> Option<f64> {
+        let found = self.exceeded_by(self.count / 2)?;
+        let lower_ns = found.checked_sub(1).map_or(0, upper_ns);
+        Some(0.5 * (lower_ns + upper_ns(found)) as f64 * 1e-3)
+    }
+
+    /// The step that holds the time that so many are above.
+    fn exceeded_by(&self, above: u64) -> Option<usize> {
         let mut seen = 0;
-        let found = self.counts.iter().rposition(|count| {
+        self.counts.iter().rposition(|count| {
             seen += u64::from(*count);
             seen > above
-        })?;
-        Some(upper_ns(found) as f64 * 1e-3)
+        })
     }
 }
 
@@ -87,11 +97,13 @@ mod tests {
     #[test]
     fn the_tail_is_what_one_in_a_thousand_exceeds() {
         let mut tail = Tail::new();
-        assert_eq!(tail.p999_us(), None);
+        assert_eq!((tail.p999_us(), tail.median_us()), (None, None));
         for k in 1..=100_000 {
             tail.add(k * 10);
         }
         let told = tail.p999_us().unwrap();
         assert!((told / 999.0 - 1.0).abs() < 0.017, "{told}");
+        let told = tail.median_us().unwrap();
+        assert!((told / 500.0 - 1.0).abs() < 0.009, "{told}");
     }
 }

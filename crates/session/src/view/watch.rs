@@ -4,9 +4,11 @@ use super::cycle::cycle_row;
 use super::hello::{Page, hello_of};
 use super::last_word;
 use super::live_view::film_of;
+use super::possible::Possible;
 use super::served::{Server, ViewAddress, serve};
 use super::watcher::Watcher;
 use crate::clips;
+use crate::connect::Reached;
 use crate::failure::Failure;
 use crate::recorded;
 use cellpos_live::{Banner, EventLine, Feed};
@@ -81,7 +83,9 @@ impl Watch {
         let server = serve(at, Arc::new(move |name| film_of(&of, name)), hub, |_| ())?;
         Ok(Self {
             server,
-            watcher: Watcher::new(vec![feed]).with_adaptation(adaptation_at),
+            watcher: Watcher::new(vec![feed])
+                .with_adaptation(adaptation_at)
+                .with_possible(Possible::new(&setup, diffusion)),
             follow,
             folder: folder.to_owned(),
             statistics: Statistics::default(),
@@ -272,6 +276,17 @@ fn conclude(watcher: &mut Watcher, end: &RunEnd) {
     };
     state.wake_us = tail("wake_us").or(state.wake_us);
     state.compute_us = tail("tick_us").or(state.compute_us);
+    let oldest = (end.summary.get("exposure_to_command_us"))
+        .and_then(|frames| frames.get("max")?.as_float());
+    let used = oldest.is_some_and(|us| us > 0.0);
+    let reached = number("fix_noise_nm").map(|fix_noise_nm| Reached {
+        fix_noise_nm,
+        loop_delay_ms: number("loop_delay_ms").filter(|_| used),
+        rms_true_nm: number("rms_true_nm"),
+        rms_measured_nm: number("rms_measured_nm"),
+        duration_s: number("duration_s").unwrap_or(0.0),
+    });
+    watcher.state.bound_nm = watcher.bound_of(reached);
     watcher.over(last_word::of_record(end));
 }
 

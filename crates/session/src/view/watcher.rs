@@ -1,8 +1,10 @@
 //! The data of page and screen, from the rows of the recorder.
 
 use super::last_word;
+use super::possible::Possible;
 use super::tail::Tail;
 use crate::adapt;
+use crate::connect::Reached;
 use crate::ended::Ended;
 use crate::words::{Level, safe_reason, sentence};
 use cellpos_live::{Banner, ClipLine, CycleRow, EventLine, Feed, LastWord, Row, State};
@@ -51,6 +53,7 @@ pub(super) struct Watcher {
     before: (u64, f64, TickCounts),
     /// Index of the first column of adaptation among the law's columns.
     adaptation_at: Option<usize>,
+    pub(super) possible: Option<Possible>,
 }
 
 impl Watcher {
@@ -66,7 +69,14 @@ impl Watcher {
             standing: (0, false),
             before: (0, 0.0, TickCounts::default()),
             adaptation_at: None,
+            possible: None,
         }
+    }
+
+    /// The same with the lowest possible error.
+    pub(super) fn with_possible(mut self, possible: Option<Possible>) -> Self {
+        self.possible = possible;
+        self
     }
 
     /// The same for a run whose record has the columns of adaptation there.
@@ -154,6 +164,9 @@ impl Watcher {
     pub(super) fn count(&mut self, record: &TickRecord) {
         self.wake.add(record.wake_ns);
         self.compute.add(record.compute_ns);
+        if let Some(possible) = &mut self.possible {
+            possible.count(record);
+        }
         let time_s = self.time_s(record.time_ns);
         let state = &mut self.state;
         state.time_s = time_s;
@@ -217,11 +230,13 @@ impl Watcher {
         self.stands(record, sink);
     }
 
-    /// Reports the tails of the ticks' times from time to time: a search through all counts.
+    /// Reports the tails of the ticks' times, and the lowest possible error, from time to time: a search through all counts.
     pub(super) fn tails(&mut self) {
         if self.told.is_multiple_of(TAILS_EVERY) {
             self.state.wake_us = self.wake.p999_us();
             self.state.compute_us = self.compute.p999_us();
+            let possible = self.possible.as_ref().zip(self.state.fix_noise_nm);
+            self.state.bound_nm = possible.and_then(|(it, noise_nm)| it.so_far_nm(noise_nm));
         }
         self.told = self.told.wrapping_add(1);
     }
@@ -259,6 +274,7 @@ impl Watcher {
         self.state = State {
             rms_nm: summary.rms_measured_nm,
             fix_noise_nm: summary.fix_noise_nm,
+            bound_nm: self.bound_of(Reached::of(summary)),
             wake_us: Some(summary.wake_us.p999),
             compute_us: Some(summary.tick_us.p999),
             late: counts.late,
@@ -270,6 +286,11 @@ impl Watcher {
             ..before
         };
         self.over(ended.last_word());
+    }
+
+    /// The lowest possible error of a run that is over, nm.
+    pub(super) fn bound_of(&self, run: Option<Reached>) -> Option<f64> {
+        self.possible.as_ref()?.of(&run?)
     }
 
     /// The run is over.

@@ -101,21 +101,21 @@ impl Decades {
         }
     }
 
-    /// Counts as steps, from the first bin to behind the last; a bin without values is a gap.
+    /// Counts as steps, each from the lower to the upper edge of its bin; a bin without values is a gap.
     pub(super) fn steps(&self, label: &str) -> Series {
         let edge = |bin: i32| 10f64.powf(f64::from(bin) / Self::A_DECADE);
-        let ends = (self.counts.keys().next(), self.counts.keys().next_back());
-        let (Some(&first), Some(&last)) = ends else {
-            return Series::step(label, &[], &[]);
-        };
-        let bins = first..=last + 1;
-        let count = |bin: i32| self.counts.get(&bin).map_or(f64::NAN, |n| *n as f64);
-        let x: Vec<f64> = bins.clone().map(edge).collect();
-        // The last step goes to its upper edge.
-        let y: Vec<f64> = bins
-            .map(|bin| if bin > last { count(last) } else { count(bin) })
-            .collect();
-        Series::step(label, &x, &y)
+        let (mut x, mut y) = (Vec::new(), Vec::new());
+        let mut next = None;
+        for (&bin, &count) in &self.counts {
+            if next.is_some_and(|next| next != bin) {
+                x.push(edge(bin));
+                y.push(f64::NAN);
+            }
+            x.extend([edge(bin), edge(bin + 1)]);
+            y.extend([count as f64; 2]);
+            next = Some(bin + 1);
+        }
+        Series::line(label, &x, &y)
     }
 }
 
@@ -185,6 +185,19 @@ mod tests {
             .filter(|row| row.len() >= 2)
             .map(|row| (row[row.len() - 2], row[row.len() - 1]))
             .unzip()
+    }
+
+    #[test]
+    fn a_bin_alone_is_as_wide_as_any_other() {
+        let mut times = Decades::default();
+        [1.0, 1.05, 100.0].into_iter().for_each(|us| times.add(us));
+        let (x, y) = counts(&times.steps("wake-up"));
+        let wide = 10f64.powf(1.0 / Decades::A_DECADE);
+        for pair in [[0, 1], [x.len() - 2, x.len() - 1]] {
+            assert!((x[pair[1]] / x[pair[0]] / wide - 1.0).abs() < 1e-6, "{x:?}");
+            assert_eq!(y[pair[0]], y[pair[1]]);
+        }
+        assert_eq!((y[0], y[y.len() - 1]), (2.0, 1.0));
     }
 
     #[test]

@@ -84,10 +84,27 @@ impl Watched {
             if let Some(status) = self.child.try_wait().expect("a child") {
                 return status;
             }
-            assert!(Instant::now() < deadline, "the run did not end");
+            assert!(
+                Instant::now() < deadline,
+                "the run did not end; its threads: {}",
+                threads(self.child.id())
+            );
             std::thread::sleep(Duration::from_millis(20));
         }
     }
+}
+
+/// Names and states of the threads of a process (R: runs, S: waits, D: waits for a disk), and their time on a processor, ticks.
+fn threads(process: u32) -> String {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task"));
+    let of = |task: std::fs::DirEntry| {
+        let stat = std::fs::read_to_string(task.path().join("stat")).ok()?;
+        let (name, rest) = stat.split_once('(')?.1.rsplit_once(')')?;
+        let words: Vec<&str> = rest.split_whitespace().collect();
+        Some(format!("{name} {} {}", words.first()?, words.get(11)?))
+    };
+    let said = tasks.into_iter().flatten().flatten().filter_map(of);
+    said.collect::<Vec<_>>().join(", ")
 }
 
 impl Drop for Watched {
