@@ -27,14 +27,7 @@ impl RigFile {
         ];
         let said = kinds.into_iter().filter(|(holds, ..)| *holds);
         said.filter_map(|(_, table, key, why)| {
-            let line = match key {
-                // Written as a table, or as the tables within it.
-                "vision" => text
-                    .lines()
-                    .position(|line| line.trim_start().starts_with("[vision"))
-                    .map(|at| at + 1),
-                _ => line_of(text, Some(table), key),
-            }?;
+            let line = line_of(text, Some(table), key)?;
             let name = match table {
                 "" => format!("[{key}]"),
                 table => format!("[{table}] {key}"),
@@ -57,8 +50,8 @@ mod tests {
 
     #[test]
     fn what_a_kind_of_rig_does_not_use_is_said_with_its_line() {
-        let cell = "[emulator]\nbead_look = \"disc\"\n[emulator.cell]\n[cell]\nbackground = \"empty.tif\"\n[vision.profile]\n\
-                    kind = \"ring\"\nedge_px = 4.0\n";
+        let cell = "[emulator]\nbead_look = \"disc\"\n[emulator.cell]\n[cell]\nbackground = \"empty.tif\"\n[vision]\n\
+                    window_px = 21\nprofile = { kind = \"ring\", edge_px = 4.0 }\n";
         let lines: Vec<String> = (unused(cell).iter())
             .filter_map(|said| Some(said.split_once(" is not")?.0.to_owned()))
             .collect();
@@ -74,8 +67,8 @@ mod tests {
         let camera = "[actuator]\nkind = \"serial\"\nport = \"p\"\n[camera]\nkind = \"socket\"\nsocket = \"s\"\n";
         let real = format!("{camera}[cell]\nbackground = \"empty.tif\"\n");
         assert_eq!(unused(&real), Vec::<String>::new());
-        let bead =
-            "[emulator]\nbead_look = \"disc\"\n[vision.profile]\nkind = \"ring\"\nedge_px = 4.0\n";
+        let bead = "[emulator]\nbead_look = \"disc\"\n[vision]\nwindow_px = 21\n\
+                    profile = { kind = \"ring\", edge_px = 4.0 }\n";
         assert_eq!(unused(bead), Vec::<String>::new());
     }
 
