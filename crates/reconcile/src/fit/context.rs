@@ -143,6 +143,12 @@ pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
 }
 
 impl Context<'_> {
+    /// Whether the plant integrates slowly enough for a nanometre of displacement to become a ramp.
+    pub(crate) fn integrates(&self) -> bool {
+        let poles = &self.problem.base.zpk.poles;
+        poles.iter().any(|p| p.norm() * self.scope.length_s < 1.0)
+    }
+
     /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
     /// is no error; a sensor that counts in steps has no pixels.
     pub(crate) fn excludes(&self, id: &str) -> bool {

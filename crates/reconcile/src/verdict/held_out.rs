@@ -54,20 +54,9 @@ impl Sums {
     }
 }
 
-/// Whether the plant integrates slowly enough for a nanometre of displacement to become a ramp.
-pub(super) fn integrates(ctx: &Context<'_>) -> bool {
-    let longest = ctx.scope.length_s;
-    ctx.problem
-        .base
-        .zpk
-        .poles
-        .iter()
-        .any(|p| p.norm() * longest < 1.0)
-}
-
 /// Free-run error on the rows of a mask: energies before and after, what the noise is expected to make, and rows.
 fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
-    let ramp = integrates(ctx);
+    let ramp = ctx.integrates();
     let noise = &ctx.problem.noise;
     let mut sums = Sums::default();
     let (before, after) = (

@@ -4,7 +4,6 @@ use crate::data::floor::FloorSource;
 use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
 use crate::verdict::battery::Hypothesis;
-use crate::verdict::held_out;
 use crate::verdict::map::DiscrepancyMap;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Definition;
@@ -216,7 +215,7 @@ impl Traces {
         let (before, sim_before) = ctx.residual(null);
         let (after, sim_after) = ctx.residual(fit);
         Self {
-            ramp: held_out::integrates(ctx),
+            ramp: ctx.integrates(),
             all: ctx
                 .problem
                 .records

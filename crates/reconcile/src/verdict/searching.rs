@@ -12,7 +12,6 @@ use crate::search::effort::Effort;
 use crate::search::sequential::{Found, search};
 use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::units::Scales;
-use crate::verdict::held_out;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
@@ -114,8 +113,7 @@ impl Searching<'_> {
     ) -> Searched {
         const MOST_ROUNDS: usize = 3;
         let base = &problem.base;
-        let rests =
-            base.free_start || self.free_gain || !held_out::integrates(&self.context(&problem, 0));
+        let rests = base.free_start || self.free_gain || !self.context(&problem, 0).integrates();
         if rests || problem.noise.coloured.is_some() || !floor.source.is_known() {
             return self.search(problem, floor, effort, None, progress);
         }

@@ -235,7 +235,7 @@ fn confirmed(
 /// The problem with a zero flow as large as the commands, of a plant that integrates: slow motion then says nothing of the response.
 fn beside_any_flow(searching: &Searching<'_>, problem: &Problem) -> Problem {
     let base = &problem.base;
-    if base.free_start || !held_out::integrates(&searching.context(problem, 0)) {
+    if base.free_start || !searching.context(problem, 0).integrates() {
         return problem.clone();
     }
     let motion_um = searching.scope.stroke_um * base.speed_per_um() * base.sample_s;
