@@ -30,7 +30,8 @@ pub enum FaultKind {
     FlowStep,
     /// The PZT moves the bead the wrong way: its sign is flipped about the zero flow.
     GainFlip,
-    /// The PZT stands at the zero flow of the time at which it began: the best that anything can do for a bead that nobody sees.
+    /// The PZT stands where the bead stands still at the time at which it began, the steady flow counted in: the best that anything can do
+    /// for a bead that nobody sees.
     HoldZeroFlow,
     /// The amplifier gives no displacement beyond [`Faults::clip_um`].
     ClipAmplifier,

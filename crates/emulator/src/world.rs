@@ -270,7 +270,9 @@ impl World {
             self.offset_um += cell.surplus_um(at_um, self.chain.bead_um() - before_um);
             cell.advance(at_um, dt_s);
         }
-        self.offset_um += self.config.drift_um_per_s * dt_s;
+        if self.stands_um.is_none() {
+            self.offset_um += self.config.drift_um_per_s * dt_s;
+        }
         let spread_um = (2.0 * self.config.diffusion_um2_per_s * dt_s).sqrt();
         self.lateral_um = confined(
             self.lateral_um + spread_um * self.brownian.normal(),

@@ -231,6 +231,7 @@ fn a_pzt_that_stands_at_the_zero_flow_lets_no_command_move_the_bead() {
                 flow_step_um: 0.5,
                 ..events
             },
+            drift_um_per_s: 3.0,
             ..quiet()
         };
         let mut world = world(&config);

@@ -11,6 +11,8 @@ use std::fmt;
 
 /// Speed with which a flow begins for a zero flow that is 1 um off, Eq. (6), 1/s: a row is named by it.
 pub(super) const GAIN_PER_S: f64 = 379.3;
+/// Answer of the user's own law, um of PZT for 1 um.
+pub(super) const OWN_KP: f64 = 0.4;
 /// Where the bead rests before a step of the flow, um; it wanders by some nm.
 const ZERO_FLOW_UM: f64 = 20.0;
 /// Start of the first event, and its errors count from there, s.
@@ -333,7 +335,9 @@ fn finish(row: &Row, seed: u64, reference: ReferenceSpec) -> Finished<Ticks> {
             .controller
             .loop_config(&setup.model)
             .expect("a configuration");
-        let law = config.with(Proportional { kp_um_per_um: 0.4 });
+        let law = config.with(Proportional {
+            kp_um_per_um: OWN_KP,
+        });
         setup.core_with(Controller::with_law(law).expect("a loop"))
     } else {
         setup.core()

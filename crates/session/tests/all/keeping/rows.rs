@@ -1,6 +1,6 @@
 //! The rows of the table, and what must hold in them.
 
-use super::held::{Held, Row};
+use super::held::{GAIN_PER_S, Held, OWN_KP, Row};
 use super::table::interval;
 use cellpos_emulator::FaultKind;
 
@@ -95,6 +95,23 @@ impl Limits {
         1.3 * row.flow_um_per_s.abs() * (delay_s + 2.0 * tick_s) + 4.0 * self.hold_um
     }
 
+    /// The same, or what a law without an integral can do if that is more: it lets a flow of `v` carry the bead towards `v / (gain kp)`, with
+    /// the time constant `1 / (gain kp)`, until the zero flow is known. Nobody can tell a flow from the walk before it has gone `z` standard
+    /// deviations of it, `v t = z sqrt(2 D t)`; flows that step 0.01 times in a second are likelier than the walk from z = 5.3 on.
+    pub(super) fn possible_um(&self, row: &Row) -> f64 {
+        const Z: f64 = 5.3;
+        const WALK_UM2_PER_S: f64 = 2.0 * 0.33;
+        let asked_um = self.furthest_um(row);
+        let speed = row.flow_um_per_s.abs();
+        if row.law != "own" || speed == 0.0 {
+            return asked_um;
+        }
+        let answer_per_s = GAIN_PER_S * OWN_KP;
+        let told_s = Z * Z * WALK_UM2_PER_S / (speed * speed) + row.delay_and_tick_s().0;
+        let carried_um = speed / answer_per_s * (1.0 - (-answer_per_s * told_s).exp());
+        asked_um.max(carried_um + 4.0 * self.hold_um)
+    }
+
     /// What a run broke.
     pub(super) fn broken(&self, row: &Row, held: &Held) -> Vec<String> {
         let mut broken = Vec::new();
@@ -111,7 +128,7 @@ impl Limits {
         if state == "running" && (held.changed || held.other_beads > 0) {
             broken.push(format!("another bead: {held}"));
         }
-        let most_um = self.furthest_um(row);
+        let most_um = self.possible_um(row);
         let far = held.furthest_um.iter().filter(|um| **um > most_um);
         if row.flow_um_per_s != 0.0 && far.clone().count() > 0 {
             let far: Vec<f64> = far.copied().collect();
@@ -133,6 +150,11 @@ impl Limits {
             text += &format!(
                 ", {far} of {events} steps beyond {most_um:.2} um ({low:.1} to {high:.1} %)"
             );
+            let possible_um = self.possible_um(row);
+            if possible_um > most_um {
+                let far = all().filter(|um| **um > possible_um).count();
+                text += &format!(", {far} beyond {possible_um:.2} um, which is possible");
+            }
         }
         text += &format!(
             ", {} another bead, {} said to be as asked, PZT off for at most {:.0} ms; RMS {truth:.1} nm, stated {stated:.1} ({:+.1} %)",

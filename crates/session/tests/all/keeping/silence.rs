@@ -26,10 +26,19 @@ pub(super) fn silent_um(law: &'static str, seed: u64, for_s: f64) -> [f64; 2] {
         ..Row::event(law, kind, for_s)
     };
     let silent = ticks(&row("link-loss", for_s), seed);
-    let stands = ticks(&row("hold-zero-flow", for_s + ANSWER_S), seed);
+    // It stands for longer than it is looked at: what a loop that was not obeyed does afterwards is no measure.
+    let stands = ticks(&row("hold-zero-flow", for_s + 0.1), seed);
+    // The bead goes two ways from the first tick on in which the line was silent.
+    let mut both = silent.iter().zip(&stands);
+    let parted = both.find(|(a, b)| a.is_running() && a.true_um != b.true_um);
+    let began_s = parted.expect("two ways").0.time_ns as f64 * 1e-9;
+    assert!(
+        (began_s - EVENT_S).abs() < 0.05,
+        "{law}: they part at {began_s} s"
+    );
     [
         furthest_um(&silent, f64::INFINITY),
-        furthest_um(&stands, EVENT_S + for_s + ANSWER_S),
+        furthest_um(&stands, began_s + for_s + ANSWER_S),
     ]
 }
 
