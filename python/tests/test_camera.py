@@ -230,36 +230,37 @@ def test_a_bead_is_held_over_a_rendered_stream(box):
     assert "jitter" in said and "dropped" in said
 
 
-BARE = """import time
+# Milliseconds of two seconds in which the emulated camera alone has a frame: its own thread makes them, as fast as the machine lets it.
+BARE = """
+import time
 from pypylon import pylon
 camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateFirstDevice())
 camera.Open()
-camera.Width.Value, camera.Height.Value = 256, 32
-camera.ExposureTimeAbs.Value, camera.AcquisitionFrameRateEnable.Value, camera.AcquisitionFrameRateAbs.Value = 500, True, 1000
+camera.Width.Value, camera.Height.Value, camera.PixelFormat.Value = 256, 32, "Mono8"
+camera.ExposureTimeAbs.Value, camera.AcquisitionFrameRateEnable.Value, camera.AcquisitionFrameRateAbs.Value = 500, True, 5000
 camera.StartGrabbing(pylon.GrabStrategy_LatestImageOnly)
-begun, frames = time.monotonic(), 0
-while time.monotonic() < begun + 1:
+begun, seen = time.monotonic(), set()
+while time.monotonic() < begun + 2:
     camera.RetrieveResult(2000, pylon.TimeoutHandling_ThrowException).Release()
-    frames += 1
-print(frames)
+    seen.add(int(1e3 * time.monotonic()))
+print(len(seen) / 2)
 """
 
 
 def pylon_alone() -> float:
-    """Frames per second of the emulator without anything of this package: its own threads make them, as fast as the machine lets them."""
     return float(subprocess.check_output([sys.executable, "-c", BARE], env=dict(os.environ, PYLON_CAMEMU="1")))
 
 
 def test_a_bead_is_held_over_the_basler_emulator(box):
     pytest.importorskip("pypylon")
     before = pylon_alone()
-    _, through, result, nm, said = held_over(box, "pylon_camera.py", "python.sock", "--bead", "camera.sock")
+    _, _, result, nm, said = held_over(box, "pylon_camera.py", "python.sock", "--bead", "camera.sock")
     alone = min(before, pylon_alone())
-    if alone < 900:
-        pytest.skip(f"this machine is too busy for the emulator: alone it gives {alone:.0f} of 1000 frames/s")
+    served = float(re.search(r" at ([\d.]+) Hz", said)[1])
+    print(f"{served:.0f} frames/s were served; the emulated camera alone has one in {alone:.0f} of 1000 milliseconds")
     assert_held(result, nm)
-    assert through["rate_hz"] > 800
-    assert "jitter" in said
+    assert served > 0.8 * alone
+    assert "jitter" in said and "dropped" in said
 
 
 def test_a_folder_of_pictures_is_served(tmp_path):

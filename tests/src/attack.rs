@@ -5,6 +5,7 @@
 //! --help` runs them in the numbers of a night; the tests of this package run a few
 //! of each.
 
+pub mod actuators;
 pub mod cameras;
 pub mod inputs;
 pub mod sockets;
@@ -241,7 +242,7 @@ fn box_rig(folder: &Path) {
 
 fn emptied(folder: &Path) {
     let _ = std::fs::remove_dir_all(folder.join("runs"));
-    for name in ["pzt", "camera.sock", "box.csv"] {
+    for name in ["pzt", "camera.sock", "actuator.sock", "box.csv"] {
         let _ = std::fs::remove_file(folder.join(name));
     }
 }

@@ -1,7 +1,7 @@
 //! Attacks on the program in the numbers of a night, as one table. Exit code 1: something broke.
 //!
 //! ```text
-//! cargo build --workspace --bins && target/debug/attack --kills 50 --inputs 100000 --boards 100 --cameras 60 --lines 60 --signals 20
+//! cargo build --workspace --bins && target/debug/attack --kills 50 --inputs 100000 --boards 100 --cameras 60 --lines 60 --actuators 25 --signals 20
 //! ```
 
 use cellpos_tests::attack::{self, Attacked, Chance};
@@ -18,14 +18,14 @@ fn option(name: &str, without: u64) -> u64 {
 fn main() -> ExitCode {
     if std::env::args().any(|word| word == "--help") {
         println!(
-            "attack [--kills 50] [--inputs 100000] [--boards 100] [--cameras 60] [--lines 60] [--signals 20] [--seed 1]\n\
+            "attack [--kills 50] [--inputs 100000] [--boards 100] [--cameras 60] [--lines 60] [--actuators 25] [--signals 20] [--seed 1]\n\
              kills: of the program, and of the rig, so many each; 0 leaves an attack out"
         );
         return ExitCode::SUCCESS;
     }
     let mut chance = Chance::new(option("--seed", 1));
     type Attack = fn(&std::path::Path, u64, &mut Chance) -> Attacked;
-    let attacks: [(&str, &str, u64, Attack); 7] = [
+    let attacks: [(&str, &str, u64, Attack); 8] = [
         ("program killed", "--kills", 50, attack::kill_the_program),
         ("rig killed", "--kills", 50, attack::kill_the_rig),
         (
@@ -46,6 +46,12 @@ fn main() -> ExitCode {
             "--lines",
             60,
             attack::sockets::hostile_camera_lines,
+        ),
+        (
+            "served actuators",
+            "--actuators",
+            25,
+            attack::actuators::hostile_actuators,
         ),
         (
             "stalls and signals",
