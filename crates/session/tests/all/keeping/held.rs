@@ -30,9 +30,17 @@ pub(super) struct Row {
     /// Speed of the flow that steps, um/s.
     pub flow_um_per_s: f64,
     pub events: Vec<(FaultKind, f64)>,
+    /// Start of the first, s.
+    pub at_s: f64,
     /// They come so often, and begin so far apart, s.
     pub times: usize,
     pub every_s: f64,
+    /// Further ones, once: what, start and duration, s.
+    pub beside: Vec<(FaultKind, f64, f64)>,
+    /// Contrast over the usual one, whose signal to noise is 50.
+    pub contrast: f64,
+    /// Rise of the zero flow, um/s.
+    pub ramp_um_per_s: f64,
     pub clip_um: f64,
     /// The rig has none of the imperfections of a real one: the limits of the table are those of such a rig.
     pub ideal: bool,
@@ -53,8 +61,12 @@ impl Row {
             second_um: None,
             flow_um_per_s: 0.0,
             events: Vec::new(),
+            at_s: EVENT_S,
             times: 1,
             every_s: 0.0,
+            beside: Vec::new(),
+            contrast: 1.0,
+            ramp_um_per_s: 1e-3,
             clip_um: 40.0,
             ideal: true,
             seconds: 4.0,
@@ -158,7 +170,8 @@ impl Row {
         world.pixel_um = self.pixel_um;
         world.ideal = self.ideal;
         world.zero_flow_wander_um = Some(6e-3);
-        world.zero_flow_drift_um_per_s = Some(1e-3);
+        world.zero_flow_drift_um_per_s = Some(self.ramp_um_per_s);
+        world.contrast_grey *= self.contrast;
         world.faults.flow_step_um = self.flow_step_um();
         world.faults.clip_um = self.clip_um;
         if self.gain != 1.0 {
@@ -173,10 +186,16 @@ impl Row {
             });
             file.near_um = Some(0.0);
         }
+        let once = self.beside.iter().map(|&(kind, at_s, for_s)| FaultEvent {
+            kind,
+            at_s,
+            for_s: Some(for_s),
+        });
+        file.emulator.faults.event.extend(once);
         for (kind, for_s) in &self.events {
             let again = (0..self.times).map(|k| FaultEvent {
                 kind: *kind,
-                at_s: EVENT_S + k as f64 * self.every_s,
+                at_s: self.at_s + k as f64 * self.every_s,
                 for_s: Some(*for_s),
             });
             file.emulator.faults.event.extend(again);

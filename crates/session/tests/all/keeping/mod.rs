@@ -5,6 +5,7 @@
 //! `KEEPING_SEEDS=a..b KEEPING_ROWS=text cargo test --release --test all keeping_table -- --ignored --nocapture`.
 //! Each run of that table has five events, so that 40 seeds are 200.
 
+mod adverse;
 mod held;
 mod law;
 mod rows;
@@ -83,17 +84,19 @@ fn the_stated_error_counts_the_moments_without_a_fix_as_they_were() {
 fn the_uncertainty_of_a_bead_that_is_not_seen_is_its_error_however_long_it_takes() {
     let seeds = table::seeds(24);
     let count = seeds.clone().count() as f64;
-    for (law, unseen_s) in [
-        ("lqg", 0.005),
-        ("pi", 0.02),
-        ("lqg", 0.1),
-        ("pi", 0.4),
-        ("lqg", 1.0),
-        ("lqg", 3.0),
+    for (law, at_s, unseen_s) in [
+        ("lqg", 0.12, 0.2),
+        ("pi", 0.3, 0.4),
+        ("lqg", 2.6, 0.005),
+        ("pi", 2.6, 0.02),
+        ("lqg", 2.6, 0.1),
+        ("pi", 2.6, 0.4),
+        ("lqg", 2.6, 1.0),
+        ("lqg", 2.6, 3.0),
     ] {
         let squares = seeds
             .clone()
-            .map(|seed| silence::squared_error(law, seed, unseen_s));
+            .map(|seed| silence::squared_error(law, seed, at_s, unseen_s));
         let mean = squares.sum::<f64>() / count;
         println!("{law}, {unseen_s} s: {mean:.2} of 1");
         // Three standard errors of the mean of squares of a normal deviate.

@@ -42,10 +42,12 @@ pub(super) fn silent_um(law: &'static str, seed: u64, for_s: f64) -> [f64; 2] {
     ]
 }
 
-/// Square of the error of the estimate over its stated variance at the end of a time without a fix.
-pub(super) fn squared_error(law: &'static str, seed: u64, unseen_s: f64) -> f64 {
+/// Square of the error of the estimate over its stated variance at the end of a time without a fix that begins so long after the rig was
+/// switched on.
+pub(super) fn squared_error(law: &'static str, seed: u64, at_s: f64, unseen_s: f64) -> f64 {
     let row = Row {
-        seconds: EVENT_S + unseen_s,
+        at_s,
+        seconds: at_s + unseen_s,
         lost_s: 100.0,
         frames: Frames::Off,
         ..Row::event(law, "drop-frames", unseen_s + 1.0)
