@@ -29,8 +29,9 @@ def rigs(tmp_path):
 
 def held(folder, rig, law, model="eq6", **more):
     options = {"rig": rig, "controller": law, "model": model, "clock": "virtual", "frames": "off", "adapt": "off"} | more
-    result = cellpos.track("0um", "120s", cwd=folder, no_record=True, **options).result
-    assert result.ended == "done" and result["ticks"] == 6000
+    duration = options.pop("duration", "120s")
+    result = cellpos.track("0um", duration, cwd=folder, no_record=True, **options).result
+    assert result.ended == "done" and result["ticks"] == 50 * int(duration[:-1])
     return result["rms_true_nm"], result["bound_rms_nm"]
 
 
@@ -45,12 +46,16 @@ def test_a_bead_is_held_at_20_ms_a_command(rigs):
     assert bound_with_tube < with_tube < 1.15 * bound_with_tube
 
 
-@pytest.mark.parametrize("seed", [4, 5, 6])
-def test_a_loop_that_adapts_holds_behind_regulator_and_tube(rigs, seed):
-    # An inverse of this path, with its zero outside the unit circle, grows by 2.7 a tick; these seeds lost the bead within 120 s.
-    nm, bound = held(rigs, "tube.toml", "lqg", "integrator.toml", adapt="on", seed=seed)
-    print(f"seed {seed}: {nm:.0f} of {bound:.0f} nm")
-    assert nm < 1.25 * bound
+def test_a_loop_that_adapts_holds_behind_regulator_and_tube(rigs):
+    # An inverse of this path, with its zero outside the unit circle, grows by 2.7 a tick: seeds 4 to 6 lost the bead. A pulse of one tick
+    # armed seeds 7 and 12 with 1.3 and 1.5 of the gain: the second lost the bead.
+    over = []
+    for seed in (4, 5, 6, 7, 11, 12):
+        nm, bound = held(rigs, "tube.toml", "lqg", "integrator.toml", adapt="on", seed=seed, duration="240s")
+        over.append(nm / bound)
+    print("of the bound:", *(f"{one:.3f}" for one in over))
+    # An RMS of 12000 ticks has a standard deviation of 1 %: half of its terms are independent.
+    assert sum(over) / len(over) < 1.15 and max(over) < 1.15 * 1.03
 
 
 def test_identify_finds_the_regulator(rigs):
