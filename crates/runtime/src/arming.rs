@@ -24,7 +24,8 @@ pub struct ArmingConfig {
     pub steady_ticks: u32,
     /// Ticks after which arming ends without a result, because the bead was not steadily seen.
     pub patience_ticks: u32,
-    /// Height of the doublet, um of PZT; less where the plant's lags ask for a longer one.
+    /// Height of the doublet, um of PZT. One made longer for the plant's lags has the height that moves the bead as far as this one does
+    /// without lags.
     pub pulse_um: f64,
     /// Ticks up, and ticks down; more where the plant's lags are longer.
     pub pulse_ticks: u32,
