@@ -1,10 +1,11 @@
 //! Recordings on disk as cameras: folders of PNG, TIFF or JPEG pictures, TIFF stacks, Photron recordings, AVI films, NumPy
 //! arrays, `.rtdc` files.
 //!
-//! [`open`] recognises the kind by the name; [`Playback`] plays a recording at its frame rate behind the
+//! [`open`] recognises the kind by the first bytes, or else by the name; [`Playback`] plays a recording at its frame rate behind the
 //! [`Camera`](cellpos_rig::Camera) trait. Not for writing.
 
 pub mod avi;
+mod format;
 mod grey;
 #[cfg(feature = "aravis")]
 pub mod industrial;
@@ -24,6 +25,8 @@ use cellpos_rig::source::FrameBuffer;
 use std::path::{Path, PathBuf};
 
 pub use avi::AviFilm;
+use format::Format;
+pub(crate) use format::conversion;
 pub use npy::NpyStack;
 pub use photron::PhotronRecording;
 pub use pictures::PictureFolder;
@@ -54,8 +57,8 @@ pub enum SourceError {
         /// Which file.
         path: PathBuf,
     },
-    /// A film in an unsupported format.
-    #[error("{}: {format} is not read here: convert it without loss with `{command}` and give that film", path.display())]
+    /// A film or stack in an unsupported format.
+    #[error("{}: {format} is not read here: convert it without loss with `{command}` and give what it writes", path.display())]
     Film {
         /// Which file.
         path: PathBuf,
@@ -229,7 +232,8 @@ pub trait Recording: Send + std::fmt::Debug {
     fn read(&mut self, index: usize, buffer: &mut FrameBuffer) -> Result<(), SourceError>;
 }
 
-/// Opens a recording of any known kind and checks its first frame.
+/// Opens a recording of any known kind and checks its first frame. What a file is, its first bytes say; its name says it where they
+/// do not.
 ///
 /// # Errors
 /// The path is not a recording, or cannot be read.
@@ -237,59 +241,23 @@ pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
     if path.is_dir() {
         return Ok(Box::new(PictureFolder::open(path)?));
     }
-    let extension = path
-        .extension()
-        .and_then(|e| e.to_str())
-        .unwrap_or_default()
-        .to_ascii_lowercase();
-    match extension.as_str() {
-        "tif" | "tiff" => Ok(Box::new(TiffStack::open(path)?)),
-        "mraw" | "cih" | "cihx" => Ok(Box::new(PhotronRecording::open(path)?)),
+    match Format::of(path)? {
+        Some(Format::Tiff) => Ok(Box::new(TiffStack::open(path)?)),
+        Some(Format::Photron) => Ok(Box::new(PhotronRecording::open(path)?)),
         #[cfg(feature = "hdf5")]
-        "rtdc" => Ok(Box::new(rtdc::RtdcRecording::open(path)?)),
-        "png" | "jpg" | "jpeg" => Ok(Box::new(PictureFolder::of(path, vec![path.to_path_buf()])?)),
-        "avi" => Ok(Box::new(AviFilm::open(path)?)),
-        "npy" => Ok(Box::new(NpyStack::open(path)?)),
-        _ if !path.exists() => Err(SourceError::Unreadable {
+        Some(Format::Rtdc) => Ok(Box::new(rtdc::RtdcRecording::open(path)?)),
+        Some(Format::Picture) => Ok(Box::new(PictureFolder::of(path, vec![path.to_path_buf()])?)),
+        Some(Format::Avi) => Ok(Box::new(AviFilm::open(path)?)),
+        Some(Format::Npy) => Ok(Box::new(NpyStack::open(path)?)),
+        Some(Format::Other(other)) => Err(SourceError::Film {
             path: path.to_path_buf(),
-            cause: std::io::Error::new(std::io::ErrorKind::NotFound, "no such file or folder"),
-        }),
-        name if FILMS.iter().any(|(film, _)| *film == name) => Err(SourceError::Film {
-            path: path.to_path_buf(),
-            format: FILMS
-                .iter()
-                .find(|(film, _)| *film == name)
-                .map_or(String::new(), |(_, format)| (*format).to_string()),
-            command: conversion(path),
+            format: other.name().to_string(),
+            command: other.conversion(path),
         }),
         _ => Err(SourceError::UnknownKind {
             path: path.to_path_buf(),
         }),
     }
-}
-
-/// Unsupported films, by the ends of their names.
-const FILMS: [(&str, &str); 9] = [
-    ("mp4", "MP4"),
-    ("m4v", "MP4"),
-    ("mov", "QuickTime"),
-    ("mkv", "Matroska"),
-    ("webm", "WebM"),
-    ("wmv", "Windows Media"),
-    ("mpg", "MPEG"),
-    ("mpeg", "MPEG"),
-    ("gif", "GIF"),
-];
-
-/// The command that makes an uncompressed grey film of any other.
-fn conversion(path: &Path) -> String {
-    let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', "'\\''"));
-    let to = path.with_extension("grey.avi");
-    format!(
-        "ffmpeg -i {} -an -fps_mode passthrough -c:v rawvideo -pix_fmt gray {}",
-        quoted(path),
-        quoted(&to)
-    )
 }
 
 /// Refuses a frame beyond the end.

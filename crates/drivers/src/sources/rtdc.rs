@@ -8,6 +8,7 @@ use super::zstandard::Rows;
 use super::{Recording, RecordingInfo, SourceError, check_size};
 use cellpos_rig::source::FrameBuffer;
 use hdf5_pure::{AttrValue, Error, File};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Most backgrounds that are averaged, and pictures of which a median is taken where the file holds none.
@@ -30,6 +31,41 @@ pub struct RtdcRecording {
     numbers: Vec<u64>,
 }
 
+/// Refuses a file that ends before the address that its superblock gives as its end (HDF5 file format, versions 0 to 3). Of a file cut
+/// off nothing else can be trusted: the list of what it holds may be in what is missing.
+fn check_whole(path: &Path) -> Result<(), SourceError> {
+    const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
+    let unreadable = |cause| SourceError::Unreadable {
+        path: path.to_path_buf(),
+        cause,
+    };
+    let file = std::fs::File::open(path).map_err(unreadable)?;
+    let length = file.metadata().map_err(unreadable)?.len();
+    let mut head = Vec::new();
+    file.take(64).read_to_end(&mut head).map_err(unreadable)?;
+    let version = head.get(8).copied();
+    // Sizes of addresses, where the addresses begin, and which of them is the end of the file.
+    let (size_at, first, which) = match version {
+        Some(0) => (13, 24, 2),
+        Some(1) => (13, 28, 2),
+        Some(2 | 3) => (9, 12, 2),
+        _ => return Ok(()),
+    };
+    let is_wide = head.starts_with(SIGNATURE) && head.get(size_at) == Some(&8);
+    let Some(end) = head.get(first + 8 * which..first + 8 * which + 8) else {
+        return Ok(());
+    };
+    let end = u64::from_le_bytes(end.try_into().unwrap_or_default());
+    if is_wide && length < end {
+        return Err(SourceError::Damaged {
+            path: path.to_path_buf(),
+            frame: 0,
+            problem: format!("the file has {length} of {end} bytes"),
+        });
+    }
+    Ok(())
+}
+
 impl RtdcRecording {
     /// Opens the file and reads its first picture.
     ///
@@ -40,6 +76,7 @@ impl RtdcRecording {
             path: path.to_path_buf(),
             cause,
         })?;
+        check_whole(path)?;
         let wrong = |error: Error| told(path, 0, &error);
         let file = File::open_streaming(path).map_err(wrong)?;
         let events = file.group("events").and_then(|events| events.datasets());

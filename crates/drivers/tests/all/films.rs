@@ -247,6 +247,44 @@ fn other_codecs_and_other_films_are_refused_with_the_command_that_converts_them(
     assert!(matches!(read(&path, 1), Err(SourceError::Damaged { .. })));
 }
 
+#[test]
+fn a_file_is_what_its_first_bytes_say_and_not_its_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, bytes: &[u8]| {
+        let path = folder.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        path
+    };
+    let film = avi(*b"Y800", 8, HEIGHT as i32, &[grey(0), grey(1)]);
+    for name in ["film.mp4", "film.tif", "film", "film.npy"] {
+        assert_eq!(
+            read(&write(name, &film), 0).unwrap().mono8,
+            grey(0),
+            "{name}"
+        );
+    }
+    let mp4 = b"\0\0\0\x20ftypisom\0\0\x02\0isomiso2";
+    for (name, bytes, way) in [
+        (
+            "film.tif",
+            &mp4[..],
+            "MP4 is not read here: convert it without loss with `ffmpeg -i",
+        ),
+        ("film.rtdc", b"\x1A\x45\xDF\xA3....", "Matroska"),
+        ("stack.nd2", b"\xDA\xCE\xBE\x0A....", "bfconvert '"),
+        ("stack.tiff", b"ZISRAWFILE......", "Zeiss CZI"),
+        ("a.cine", b"CI\x2C\0....", "-pix_fmt gray"),
+        ("a.png", b"BM......", "ffmpeg -i '"),
+        ("it's.npz", b"PK\x03\x04....", "numpy.save"),
+    ] {
+        let error = sources::open(&write(name, bytes)).unwrap_err();
+        assert!(matches!(error, SourceError::Film { .. }), "{name}: {error}");
+        assert!(error.to_string().contains(way), "{name}: {error}");
+    }
+    let error = sources::open(&write("notes.txt", b"text")).unwrap_err();
+    assert!(matches!(error, SourceError::UnknownKind { .. }), "{error}");
+}
+
 fn npy(descr: &str, order: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let mut header =
         format!("{{'descr': '{descr}', 'fortran_order': {order}, 'shape': {shape}, }}");
