@@ -39,6 +39,7 @@ mod lines;
 mod localiser;
 pub mod many;
 mod objects;
+mod observed;
 mod offsets;
 mod outline;
 mod pool;

@@ -349,14 +349,15 @@ fn settings(
     }
     let radius_px = (core_knots(&values) * knot_px).max(1.0);
     let value = |r_px: f64| values[((r_px / knot_px).round() as usize).min(TABLE_KNOTS - 1)];
-    let extent_px = reach::extent_px(value, reach_px, snr).max(1.3 * radius_px);
+    let extent_px = reach::extent_px(value, reach_px, snr);
     let spec = ProfileSpec::Table {
         radius_px: rounded(radius_px, 100.0),
         knot_px: rounded(knot_px, 1e4),
         values: values.map(|v| rounded(v, 1e4)),
     };
     let mut config = LocaliserConfig::new(spec);
-    config.window_px = (2 * extent_px.ceil() as usize + 1).clamp(15, MAX_WINDOW_PX);
+    let whole = 2 * extent_px.ceil() as usize + 1;
+    config.window_px = whole.clamp(config.window_px, MAX_WINDOW_PX);
     config.polarity = if extreme > 0.0 {
         Polarity::Bright
     } else {

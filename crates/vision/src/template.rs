@@ -180,6 +180,14 @@ impl Template {
         self.read(self.place(q_px2))
     }
 
+    /// Sum of the second derivatives by the two directions at the squared radius `q_px2`, 1/px^2.
+    #[inline]
+    pub(crate) fn laplacian(&self, q_px2: f32) -> f32 {
+        let (entry, t) = self.place(q_px2);
+        let e = &self.table[entry as usize & (TABLE_LEN - 1)];
+        4.0 * self.slope_factor() * (e[2] + t * e[3] + q_px2 * self.entries_per_px2 * e[3])
+    }
+
     /// Normalised value at the squared radius `q_px2` (px^2).
     #[inline]
     pub fn value_at_squared(&self, q_px2: f32) -> f32 {

@@ -7,6 +7,7 @@ use crate::fit::Weights;
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::left::Left;
+use crate::observed;
 use crate::residue::POOLED_FIXES;
 use crate::template::Template;
 
@@ -18,8 +19,9 @@ const WIDENED_LOCALLY: f64 = 1.2;
 /// Mean square of the measured ring about its mean in its window of 25 px (`the_measured_bead_fills_its_window...`).
 const MEASURED: f64 = 0.135;
 
-/// Radius of a bead that patches of whole pixels do not resolve. Then the residual of the pixels that tell the place counts.
-const UNRESOLVED_PX: f64 = 2.5;
+/// Radius of a bead that patches of three pixels do not resolve: they are at most 0.8 of it. Then the residual of the pixels that tell
+/// the place counts.
+const UNRESOLVED_PX: f64 = 3.75;
 /// Square of the least answer of a picture to a motion of the bead, over the template's: below, noise decides.
 const LEAST_ANSWER: f64 = 0.04;
 /// Share of fixes that something spoils which spoils no others, before the window is looked at.
@@ -43,8 +45,6 @@ impl Localiser {
             Weights::Shot { base, .. } => f64::from(base),
         };
         let snr = self.sign * amplitude / variance.sqrt();
-        // Whether the light that rises is that which the bead is seen by, nobody says.
-        let shaded = |slope: f64| (self.shading_px2 * slope / background.max(1.0)).powi(2);
         let in_window =
             |c: f64, first: usize, len: usize| c >= first as f64 && c <= (first + len - 1) as f64;
         let kept = in_window(f.x_px, self.crop.x0, self.crop.width)
@@ -61,8 +61,8 @@ impl Localiser {
         Fix {
             x_px: f.x_px,
             y_px: f.y_px,
-            var_x_px2: unit * f.pass.covariance[(0, 0)] + shaded(f.slope.0),
-            var_y_px2: unit * f.pass.covariance[(1, 1)] + shaded(f.slope.1),
+            var_x_px2: unit * f.pass.covariance[(0, 0)],
+            var_y_px2: unit * f.pass.covariance[(1, 1)],
             cov_xy_px2: unit * f.pass.covariance[(0, 1)],
             amplitude,
             background,
@@ -184,24 +184,55 @@ impl Localiser {
             self.narrow(fix);
             self.add_lines(fix, left);
         }
+        let observed = self.observe(fix);
         let more = fix.residual_ratio > WIDENED_RATIO || self.local.mean > WIDENED_LOCALLY;
-        let widening = if more {
-            self.widening_by_what_is_left(fix)
+        let (widening, answer) = if more {
+            let (widening, of_rings) = self.widening_by_what_is_left(fix);
+            let by_rings = self.template.radius_px() >= UNRESOLVED_PX || !self.comb.is_still();
+            (widening, if by_rings { of_rings } else { observed })
         } else {
-            self.widening_by_pixels(
-                left.local_variance / self.pixel_variance(fix.background),
-                0.0,
-            )
+            let left = left.local_variance / self.pixel_variance(fix.background);
+            (self.widening_by_pixels(left, 0.0), observed)
         };
-        fix.var_x_px2 *= widening;
-        fix.var_y_px2 *= widening;
-        fix.cov_xy_px2 *= widening;
+        // One window tells it with noise; the last fixes have been in a like focus.
+        let answer = if self.comb.is_still() || more {
+            self.answers.shrink(answer, 1.0, POOLED_FIXES)
+        } else {
+            1.0
+        };
+        let all = widening / (answer * answer).max(LEAST_ANSWER);
+        fix.var_x_px2 *= all;
+        fix.var_y_px2 *= all;
+        fix.cov_xy_px2 *= all;
         widening
+    }
+
+    /// How much the picture of a bead at rest answers to a motion, over how much the template does. Takes in how much its score
+    /// scatters.
+    fn observe(&mut self, fix: &Fix) -> f64 {
+        if !self.comb.is_still() {
+            return 1.0;
+        }
+        let background = fix.background - f64::from(self.crop.pedestal);
+        let parts = (fix.amplitude, background);
+        let seen = observed::of(&self.crop, &self.template, (fix.x_px, fix.y_px), parts);
+        let white = self.white_scatter * self.pixel_variance(fix.background);
+        self.scatter.take_in(seen.scatter / white);
+        seen.answer
+    }
+
+    /// Adds what light that rises by a slope along row and column, grey levels a px, may have moved the fix by: whether it is the light
+    /// that the bead is seen by, nobody says.
+    pub(super) fn add_shading(&self, fix: &mut Fix, slope: (f64, f64)) {
+        let moves = |slope: f64| self.shading_px2 * slope / fix.background.max(1.0);
+        let (x_px, y_px) = (moves(slope.0), moves(slope.1));
+        fix.var_x_px2 += x_px * x_px;
+        fix.var_y_px2 += y_px * y_px;
     }
 
     /// The same where it leaves more than noise: what patches and pixels leave besides their mean all round. That mean tells how
     /// much steeper the template is than the bead.
-    fn widening_by_what_is_left(&mut self, fix: &Fix) -> f64 {
+    fn widening_by_what_is_left(&mut self, fix: &Fix) -> (f64, f64) {
         let at = (fix.x_px, fix.y_px);
         let background = fix.background - f64::from(self.crop.pedestal);
         let variance = self.pixel_variance(fix.background);
@@ -214,7 +245,7 @@ impl Localiser {
             variance,
         );
         let by_patches = by_patches.unwrap_or(fix.residual_ratio).max(1.0);
-        let (local, answers) = self.residues.besides_the_mean(
+        let (local, answer) = self.residues.besides_the_mean(
             &self.crop,
             &self.template,
             &self.comb,
@@ -224,9 +255,7 @@ impl Localiser {
         // A ring's mean takes a part of its pixels: two thirds of one of 2 pi r, at half the radius.
         let by_rings = 2.0 / 3.0 * self.template.radius_px();
         let by_pixels = self.widening_by_pixels(local / variance, by_rings);
-        // One window tells it with noise; the last fixes have been in a like focus.
-        let answers = self.answers.shrink(answers, 1.0, POOLED_FIXES);
-        by_pixels.max(by_patches) / (answers * answers).max(LEAST_ANSWER)
+        (by_pixels.max(by_patches), answer)
     }
 
     /// What the pixels that tell the place leave, over noise. Of a narrow bead they are few: their variance is that of the last
@@ -245,15 +274,14 @@ impl Localiser {
         if radius_px >= UNRESOLVED_PX {
             return 1.0;
         }
-        let usual = self.local.mean.max(1.0);
-        let ratio = (own / usual).max(1.0);
+        let ratio = (own / self.local.mean.max(1.0)).max(1.0);
         let odds = SPOILT * (0.5 * freedom * (ratio - 1.0 - ratio.ln())).exp();
         let spoilt = if odds.is_finite() {
             odds / (1.0 + odds)
         } else {
             1.0
         };
-        usual + spoilt * (ratio - 1.0) * usual
+        self.scatter.mean.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
     }
 
     /// Part of the whole window that the bead fills, for the tolerance of a template's error: see [`filled`].

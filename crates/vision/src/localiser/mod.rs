@@ -17,6 +17,7 @@ use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
 use crate::left::Left;
+use crate::observed;
 use crate::pool::Pool;
 use crate::residue::Residues;
 use crate::seed;
@@ -69,6 +70,9 @@ pub struct Localiser {
     filled: [f64; 2],
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
     local: Pool,
+    /// The same of the score of the place, which counts alike errors of neighbours; and what it is for white noise.
+    scatter: Pool,
+    white_scatter: f64,
     lines: [Pool; 2],
     /// What the last fixes were widened by, and their residual ratios.
     widened: Pool,
@@ -104,6 +108,7 @@ impl Localiser {
         let learner = config
             .learning
             .map(|l| Learner::new(l, config.window_px, &template));
+        let white_scatter = observed::of_white(&template, config.window_px);
         let filled = judge::filled(&template, config.window_px);
         let shading_px2 = judge::shading_px2(&template, config.window_px);
         Ok(Localiser {
@@ -121,6 +126,8 @@ impl Localiser {
             shading_px2,
             filled,
             local: Pool::default(),
+            scatter: Pool::default(),
+            white_scatter,
             lines: [Pool::default(); 2],
             widened: Pool::default(),
             ratio: Pool::default(),
@@ -280,6 +287,7 @@ impl Localiser {
         let fitted = self.refine(view, fitted, (x_px, y_px), side_px);
         let found = fitted.as_ref().map(|f| f.pass);
         let left = fitted.as_ref().map_or(Left::default(), |f| f.left);
+        let slope = fitted.as_ref().map_or((0.0, 0.0), |f| f.slope);
         let mut fix = self.judge(view.frame, fitted, (x_px, y_px));
         if fix.verdict == FixQuality::BadFit && view.pardons {
             self.pardon(view.frame, &mut fix);
@@ -288,6 +296,7 @@ impl Localiser {
             return fix;
         }
         let widening = self.widen(&mut fix, &left);
+        self.add_shading(&mut fix, slope);
         if fix.verdict == FixQuality::Good
             && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
         {
@@ -356,6 +365,7 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         if learner.take_in(&self.crop, (fix.x_px, fix.y_px), fix.amplitude, background) {
             learner.refresh(&mut self.template);
+            self.white_scatter = observed::of_white(&self.template, self.config.window_px);
             self.filled = judge::filled(&self.template, self.config.window_px);
             self.shading_px2 = judge::shading_px2(&self.template, self.config.window_px);
         }
