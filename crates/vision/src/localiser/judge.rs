@@ -19,9 +19,8 @@ const WIDENED_LOCALLY: f64 = 1.2;
 /// Mean square of the measured ring about its mean in its window of 25 px (`the_measured_bead_fills_its_window...`).
 const MEASURED: f64 = 0.135;
 
-/// Radius of a bead that patches of three pixels do not resolve: they are at most 0.8 of it. Then the residual of the pixels that tell
-/// the place counts.
-const UNRESOLVED_PX: f64 = 3.75;
+/// Radius of a bead that patches of whole pixels do not resolve. Then the residual of the pixels that tell the place counts.
+const UNRESOLVED_PX: f64 = 2.5;
 /// Square of the least answer of a picture to a motion of the bead, over the template's: below, noise decides.
 const LEAST_ANSWER: f64 = 0.04;
 /// Share of fixes that something spoils which spoils no others, before the window is looked at.
