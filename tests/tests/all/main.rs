@@ -11,3 +11,4 @@ mod rig_in_a_box;
 mod rig_page;
 mod rig_prove;
 mod scripts;
+mod ten_boxes;

@@ -62,21 +62,42 @@ fn the_chain_has_every_command_in_its_order() {
     assert_eq!(words, expected);
 }
 
-#[test]
-#[ignore = "long: identifies in real time, a minute to three: cargo test --workspace --test all rig_page:: -- --ignored --nocapture"]
-fn a_newcomer_comes_from_the_box_to_a_held_bead_with_the_commands_of_the_page() {
+/// How a chain ended: RMS of the measured error, and the lowest possible one if it is stated, nm.
+struct Ended {
+    rms_nm: f64,
+    bound_nm: Option<f64>,
+}
+
+/// The page's chain on the box of a seed, unattended; `look`: what beads look like, which the live camera is then asked to find.
+fn followed(seed: u64, look: Option<&str>) -> Result<Ended, String> {
     let folder = tempfile::tempdir().expect("a folder");
-    let rig = RigInABox::start(folder.path(), &["--duration", "600s"]);
+    let folder = folder.path();
+    let emulator = format!("[emulator]\nseed = {seed}\n{}", look.unwrap_or_default());
+    std::fs::write(folder.join("box.toml"), emulator).expect("written");
+    let rig = RigInABox::start(folder, &["--rig", "box.toml", "--duration", "900s"]);
+    let mut report = String::new();
     for line in chain() {
-        let began = std::time::Instant::now();
-        let out = run(folder.path(), &line);
-        println!("{:6.1} s  {line}", began.elapsed().as_secs_f64());
-        assert!(
-            out.status.success(),
-            "{line}\n{}\n{}",
-            String::from_utf8_lossy(&out.stdout),
-            String::from_utf8_lossy(&out.stderr)
-        );
+        let is = |word: &str| line.starts_with(&format!("cellpos {word} "));
+        let line = match is("track") {
+            // Long enough for an RMS that is known to 2 %.
+            true => line.replace("5s", "20s") + " --json",
+            false => line.clone(),
+        };
+        let found = (is("calibrate") && look.is_some()).then(|| {
+            "cellpos camera --rig rig.toml --find-beads beads.png --duration 3s".to_string()
+        });
+        for line in found.into_iter().chain([line]) {
+            let began = std::time::Instant::now();
+            let out = run(folder, &line);
+            println!("{:6.1} s  {line}", began.elapsed().as_secs_f64());
+            report = programs::stdout(&out);
+            if !out.status.success() {
+                return Err(format!(
+                    "{line}\n{report}\n{}",
+                    String::from_utf8_lossy(&out.stderr)
+                ));
+            }
+        }
     }
     for name in [
         "rig.toml",
@@ -85,27 +106,90 @@ fn a_newcomer_comes_from_the_box_to_a_held_bead_with_the_commands_of_the_page() 
         "model.toml",
         "controller.toml",
     ] {
-        assert!(folder.path().join(name).is_file(), "{name}");
+        assert!(folder.join(name).is_file(), "{name}");
     }
-    let calibration = std::fs::read_to_string(folder.path().join("calibration.toml")).unwrap();
-    assert!(
-        calibration.contains("axis = \"x\"\nsign = 1\n"),
-        "the box's own: {calibration}"
+    let calibration = std::fs::read_to_string(folder.join("calibration.toml")).unwrap();
+    if !calibration.contains("axis = \"x\"\nsign = 1\n") {
+        return Err(format!("not the box's own: {calibration}"));
+    }
+    let result: serde_json::Value = serde_json::from_str(&report).expect("JSON");
+    // The run began at the zero flow that the identification measured with this board.
+    let table = |path: PathBuf| -> toml::Table {
+        std::fs::read_to_string(path)
+            .expect("a file")
+            .parse()
+            .expect("TOML")
+    };
+    let run = folder.join(result["run"].as_str().expect("a run"));
+    let (began, model) = (
+        table(run.join("run.toml")),
+        table(folder.join("model.toml")),
     );
-    // Held for the last second of the five, and parked afterwards.
+    assert_eq!(
+        began["config"]["neutral_um"], model["working_point_um"],
+        "{model}"
+    );
+    // Held for the last second, and parked afterwards.
     let rows = rig.finish();
     let moved = |um: f64| (um - 20.0).abs() > 1e-3;
-    let last = rows
-        .iter()
-        .rposition(|row| row.state == "Running" && moved(row.applied_um));
-    let last = last.expect("the loop moved the PZT");
+    let last = (rows.iter())
+        .rposition(|row| row.state == "Running" && moved(row.applied_um))
+        .expect("the loop moved the PZT");
     let held = &rows[last.saturating_sub(1000)..last];
     let rms_um =
         (held.iter().map(|row| row.bead_um.powi(2)).sum::<f64>() / held.len() as f64).sqrt();
-    println!("held within {rms_um:.3} um RMS");
-    assert!(rms_um < 2.0, "{rms_um} um");
     let end = rows.last().expect("rows");
-    assert!((end.applied_um - 20.0).abs() < 0.01, "{end:?}");
+    if rms_um > 2.0 || (end.applied_um - 20.0).abs() > 0.01 {
+        return Err(format!("{rms_um} um RMS in the end, {end:?}"));
+    }
+    Ok(Ended {
+        rms_nm: result["rms_measured_nm"].as_f64().expect("an error"),
+        bound_nm: result["bound_rms_nm"].as_f64(),
+    })
+}
+
+#[test]
+#[ignore = "identifies in real time, two minutes a chain: CHAIN_SEEDS=20 cargo test --release --workspace --test all rig_page:: -- --ignored --nocapture (without CHAIN_SEEDS: four, and three other looks)"]
+fn a_newcomer_comes_from_the_box_to_a_held_bead_with_the_commands_of_the_page() {
+    let number = |name: &str, instead: u64| {
+        let given = std::env::var(name).ok();
+        given.map_or(instead, |n| n.parse().expect("a whole number"))
+    };
+    let (first, seeds) = (number("CHAIN_FIRST", 71_501), number("CHAIN_SEEDS", 4));
+    let looks = [
+        "bead_look = \"ring\"\nbead_radius_um = 0.4\ncontrast_grey = 60.0\n",
+        "bead_look = \"disc\"\nbead_radius_um = 0.6\ncontrast_grey = -60.0\n",
+        "bead_look = \"spot\"\nbead_radius_um = 0.25\ncontrast_grey = 25.0\n",
+    ];
+    let chains = (0..seeds)
+        .map(|n| (first + n, None))
+        .chain((0..).zip(looks).map(|(n, look)| (first + n, Some(look))));
+    let (mut failed, mut ratios) = (Vec::new(), Vec::new());
+    for (seed, look) in chains {
+        println!("seed {seed}, {}", look.unwrap_or("as it comes"));
+        match followed(seed, look) {
+            Ok(Ended { rms_nm, bound_nm }) => {
+                let ratio = bound_nm.map(|nm| rms_nm / nm);
+                println!("  held within {rms_nm:.1} nm RMS, {ratio:.3?} of the lowest possible");
+                // An RMS of 20 s is known to 2 %.
+                match ratio {
+                    Some(ratio) if ratio < 1.1 + 0.06 => ratios.push(ratio),
+                    other => failed.push(format!("seed {seed}: {other:?} of the bound")),
+                }
+            }
+            Err(why) => {
+                println!("  FAILED: {why}");
+                failed.push(format!("seed {seed}: {why}"));
+            }
+        }
+    }
+    let mean = ratios.iter().sum::<f64>() / ratios.len().max(1) as f64;
+    println!(
+        "{} chains held, {mean:.3} of the bound in the mean",
+        ratios.len()
+    );
+    assert!(failed.is_empty(), "{failed:#?}");
+    assert!(mean < 1.1, "{mean}");
 }
 
 #[test]

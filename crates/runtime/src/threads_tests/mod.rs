@@ -23,10 +23,12 @@ use rtrb::RingBuffer;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 
+mod peers;
 mod rig;
 mod scheduler;
 mod stops;
 
+use peers::*;
 use rig::*;
 use scheduler::*;
 

@@ -66,6 +66,8 @@ pub(super) struct Faults {
     pub(super) dies: Option<(Thread, i64)>,
     /// What goes wrong on the line to the board; its times count from the start of the run.
     pub(super) line: LineFaults,
+    /// What board and camera do of themselves.
+    pub(super) peers: Peers,
     pub(super) camera_hz: f64,
     /// Frames are sound until then, ns.
     pub(super) calm_ns: i64,
@@ -102,6 +104,7 @@ impl Default for Faults {
             deaf: None,
             dies: None,
             line: LineFaults::default(),
+            peers: Peers::default(),
             camera_hz: 1000.0,
             calm_ns: 0,
         }
@@ -234,6 +237,7 @@ pub(super) fn at(rig: &Shelf, now_ns: i64) -> MutexGuard<'_, Rig> {
 pub(super) struct Line {
     pub(super) rig: Shelf,
     pub(super) clock: Clock,
+    pub(super) answers: Answers,
 }
 
 impl Port for Line {
@@ -257,11 +261,20 @@ impl Port for Line {
     }
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        let mut rig = at(&self.rig, self.clock.now_ns());
+        let now_ns = self.clock.now_ns();
+        let mut rig = at(&self.rig, now_ns);
         if rig.line_is_dead {
             return Err(std::io::ErrorKind::BrokenPipe.into());
         }
-        Ok(rig.emulated.transmit(buffer))
+        let mut sent = [0; 512];
+        loop {
+            let length = rig.emulated.transmit(&mut sent);
+            if length == 0 {
+                break;
+            }
+            self.answers.sent(&sent[..length], now_ns);
+        }
+        Ok(self.answers.take(buffer, now_ns))
     }
 }
 
@@ -272,6 +285,8 @@ pub(super) struct Source {
     pub(super) faults: Faults,
     pub(super) dice: Dice,
     pub(super) frames: u64,
+    /// Whether the last frame of a camera at half its rate was not made.
+    pub(super) skipped: bool,
     /// When each frame arrives, in order.
     pub(super) queue: VecDeque<(i64, Measurement)>,
 }
@@ -290,6 +305,12 @@ impl Source {
                 break;
             };
             drop(rig);
+            let halved = (self.faults.peers.half_the_rate_ns)
+                .is_some_and(|(from, until)| (from..until).contains(&fix.info.delivery_ns));
+            self.skipped = halved && !self.skipped;
+            if self.skipped {
+                continue;
+            }
             let n = self.frames;
             self.frames += 1;
             let mut m = Measurement {
@@ -297,7 +318,7 @@ impl Source {
                     Some(first) if n >= first => n - first,
                     _ => self.faults.first.1.wrapping_add(n),
                 },
-                mid_exposure_ns: fix.info.mid_exposure_ns,
+                mid_exposure_ns: self.faults.peers.stamp_ns(fix.info.mid_exposure_ns),
                 ready_ns: 0,
                 position_um: fix.x_um,
                 variance_um2: fix.variance_um2,
@@ -334,6 +355,7 @@ impl Source {
             {
                 arrives_ns = until_ns;
             }
+            let arrives_ns = self.faults.peers.arrival_ns(arrives_ns);
             self.arrive(arrives_ns, m);
             if self.dice.hits(self.faults.doubled) {
                 self.arrive(arrives_ns + MS / 2, m);

@@ -193,21 +193,26 @@ pub(super) fn armed(seed: u64, faults: &Faults, clock: &Clock) -> (Shelf, HostBo
     let line = Line {
         rig: Arc::clone(&rig),
         clock: clock.clone(),
+        answers: Answers::new(&faults.peers, seed),
     };
     // Sound until the run has begun.
     let line = MisbehavingLine::new(line, clock.clone(), LineFaults::default(), seed);
     let mut board = BoardHost::connect(line, clock.clone()).expect("a board");
     board.count_from(faults.first.2);
     let limits = file().limits;
-    let armed = board
-        .arm(&ArmRequest {
-            session: 4711,
-            park_um: limits.park_um,
-            limits: [limits.low_um, limits.high_um, limits.slew_um_per_s],
-            watchdog_ms: Some(100),
-            hold_watchdog_ms: None,
-        })
-        .expect("armed");
+    let request = |session| ArmRequest {
+        session,
+        park_um: limits.park_um,
+        limits: [limits.low_um, limits.high_um, limits.slew_um_per_s],
+        watchdog_ms: Some(100),
+        hold_watchdog_ms: None,
+    };
+    if faults.peers.forgets_ns.is_some() {
+        // The session that it will remember.
+        board.arm(&request(4710)).expect("armed");
+        board.disarm().expect("disarmed");
+    }
+    let armed = board.arm(&request(4711)).expect("armed");
     (rig, board, armed.applied_um)
 }
 
@@ -235,6 +240,7 @@ fn source(seed: u64, faults: &Faults, rig: &Shelf, clock: &Clock) -> Source {
         faults: faults.clone(),
         dice: Dice::new(seed ^ 0x1234),
         frames: 0,
+        skipped: false,
         queue: VecDeque::new(),
     }
 }
