@@ -48,7 +48,7 @@ pub struct WorldConfig {
     pub electrons_per_grey: f64,
     /// Localisation noise of positions delivered without pictures, um RMS. Default: as from pictures.
     pub localisation_um: Option<f64>,
-    /// Time after which a new bead comes, once the old one has left the frame and the flow is slow, ms. Left out: never.
+    /// Time after which a new bead comes, once the old one has left the frame, ms. Left out: never.
     pub new_bead_after_ms: Option<f64>,
     /// Switches off all `Imperfections` of a real rig, except those whose key is given.
     pub ideal: bool,

@@ -359,12 +359,14 @@ impl World {
             return;
         }
         let since_ns = *self.out_since_ns.get_or_insert(self.now_ns);
-        // A bead that crosses the frame in less than five hundred exposures is useless.
+        // The liquid carries the beads: the next one comes in upstream. Where it would take more than five hundred exposures to cross the
+        // frame, it is put into the middle.
         let flow_um_per_s = self.chain.flow_um_per_s() + self.config.drift_um_per_s;
         let field_um = f64::from(self.config.width_px) * self.config.pixel_um;
         let slow = flow_um_per_s.abs() < 0.002 * field_um * self.config.rate_hz;
-        if slow && (self.now_ns - since_ns) as f64 * 1e-6 >= after_ms {
-            self.offset_um = -self.chain.bead_um();
+        if (self.now_ns - since_ns) as f64 * 1e-6 >= after_ms {
+            let upstream_um = -self.config.half_frame_um().copysign(flow_um_per_s);
+            self.offset_um = if slow { 0.0 } else { upstream_um } - self.chain.bead_um();
             self.out_since_ns = None;
         }
     }

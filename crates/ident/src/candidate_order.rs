@@ -106,6 +106,8 @@ pub struct DelayPrior {
     pub sd_s: f64,
     /// Half of its 95 % interval, s: not 1.96 standard deviations if its error is not normal.
     pub half95_s: f64,
+    /// Most by which what was measured otherwise may differ from the delay of the record besides, s.
+    pub not_accounted_s: f64,
 }
 
 /// One order fitted.

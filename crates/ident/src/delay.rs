@@ -43,6 +43,8 @@ pub struct DelayEstimate {
     pub ci95_s: [f64; 2],
     /// Edges used.
     pub edges: usize,
+    /// Most by which the delay of a record may differ from it besides, s; 0 for edges through the same device at the same times.
+    pub not_accounted_s: f64,
 }
 
 /// Times at which to switch the light: `count` edges, `spacing_s` apart, each dithered over one frame period. The dither is
@@ -217,6 +219,7 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
             sd_s: width / 12f64.sqrt(),
             ci95_s: [delay_s - 0.475 * width, delay_s + 0.475 * width],
             edges: n,
+            not_accounted_s: 0.0,
         });
     }
     let [low, high] = most_agreed(&spans);
@@ -237,6 +240,7 @@ pub fn delay_from_edges(edges: &[SeenEdge]) -> Result<DelayEstimate, IdentError>
         sd_s: (most - least) / 3.92,
         ci95_s: [least, most],
         edges: n,
+        not_accounted_s: 0.0,
     })
 }
 
@@ -255,6 +259,7 @@ fn median(times: &[f64], edges: usize) -> DelayEstimate {
         sd_s: (high - low) / 3.92,
         ci95_s: [low, high],
         edges,
+        not_accounted_s: 0.0,
     }
 }
 

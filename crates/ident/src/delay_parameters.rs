@@ -15,7 +15,7 @@ pub(crate) fn delay_parameter(
     let meaning = "delay from the command to the middle of the exposure";
     match prior {
         Some(prior) => {
-            let half = prior.half95_s * 1e3;
+            let half = (prior.half95_s + prior.not_accounted_s) * 1e3;
             let value = model.delay_s * 1e3;
             IdentifiedParameter {
                 name: "delay_ms",

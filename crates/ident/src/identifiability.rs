@@ -46,8 +46,9 @@ const PROFILE_RISE: f64 = 3.841;
 /// Factor from a 95 % to a 99.9 % interval: two 95 % intervals fail to overlap by chance in a few runs of a hundred.
 const SURE: f64 = 3.29 / 1.96;
 
-/// Error that neither LED test nor phase slope covers, s: half of the converter's update step of 0.1 ms.
-const NOT_ACCOUNTED_S: f64 = 5e-5;
+/// Error that neither LED test nor phase slope covers, s: half of the converter's update step of 0.1 ms. The edges of the LED fall
+/// anywhere in a step; the commands of a loop come at one place in it, which changes with the machine's load.
+pub const NOT_ACCOUNTED_S: f64 = 5e-5;
 
 /// Profile interval of the far zero's lead, ms, searched in 0..`LEAD_MOST_MS` sampling periods.
 fn lead_interval_ms(

@@ -96,6 +96,7 @@ pub fn summarise(
         delay_s: l.delay_s,
         sd_s: l.sd_s.max(1e-7),
         half95_s: (0.5 * (l.ci95_s[1] - l.ci95_s[0])).max(1e-7),
+        not_accounted_s: l.not_accounted_s,
     });
     let judged = judge(&problem, &selection, prior, bootstrap, seed);
     let disagreement = judged.contradiction_s;

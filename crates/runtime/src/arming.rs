@@ -108,8 +108,8 @@ pub struct Arming {
 pub struct ArmingState {
     ticks: u32,
     steady: u32,
-    /// Whether there was a position at all.
-    seen: bool,
+    /// Ticks since the last position.
+    unseen: u32,
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
     base_um: f64,
@@ -162,7 +162,7 @@ impl ArmingState {
 const MOST_SILENT: u32 = 3;
 /// Pulses made again at most: a rig that is disturbed every time is not fit to be closed.
 const MOST_REPEATED: u32 = 8;
-/// Ticks without any position after which the PZT goes to where the bead is believed to rest.
+/// Ticks without a position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
 const SEARCH_UM: f64 = 0.1;
@@ -260,9 +260,10 @@ impl Arming {
 
     /// One tick.
     ///
-    /// The PZT is held where it stands, which may be where a person has brought the bead to rest. Where no bead is to be
-    /// seen (a board that has parked flings it away, and the next one too) it goes to the believed rest, so that one can
-    /// come.
+    /// While a bead is seen, the PZT is held where it stands, which may be where a person has brought the bead to rest. Where none is
+    /// seen (a board that has parked flings it away, and the next one too) the PZT goes to the believed rest, so that one can stay.
+    /// Each bead that passes tells the estimator the flow, and so moves that belief to where it would have stood still. The tracker takes
+    /// a bead that moves less than some 2 px a frame for one: 200 um/s at 0.1 um/px, which is a zero flow 0.5 um off.
     pub fn step(&self, state: &mut ArmingState, input: &ArmingInput) -> Step {
         let ArmingInput {
             position_um,
@@ -272,7 +273,10 @@ impl Arming {
         } = *input;
         let steps = u32::try_from(input.steps).unwrap_or(u32::MAX);
         state.ticks = state.ticks.saturating_add(steps);
-        state.seen |= position_um.is_some();
+        state.unseen = match position_um {
+            Some(_) => 0,
+            None => state.unseen.saturating_add(steps),
+        };
         state.silent = if input.framed { 0 } else { state.silent + 1 };
         let Some(pulse) = state.pulse else {
             if position_um.is_some() {
@@ -295,7 +299,7 @@ impl Arming {
             if state.ticks > self.config.patience_ticks {
                 return Step::Done(GainCheck::unmeasured(Some(Refusal::NoBead)));
             }
-            if state.seen || state.ticks <= UNSEEN_TICKS || !neutral_um.is_finite() {
+            if state.unseen <= UNSEEN_TICKS || !neutral_um.is_finite() {
                 return Step::Command(command_um);
             }
             let away_um = neutral_um - command_um;
@@ -319,7 +323,6 @@ impl Arming {
                 let base_um = state.base_um;
                 *state = ArmingState {
                     repeated: state.repeated + 1,
-                    seen: true,
                     all: state.all,
                     calm: state.calm,
                     ..ArmingState::default()

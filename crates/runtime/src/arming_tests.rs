@@ -81,7 +81,7 @@ fn arm(
 }
 
 #[test]
-fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
+fn the_pzt_goes_to_the_believed_rest_where_no_bead_is_seen_and_that_may_be_where_it_stands() {
     let arming = Arming::new(
         ArmingConfig::default(),
         &TransferFunction::eq6(),
@@ -90,17 +90,16 @@ fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
         1.0,
     )
     .expect("eq6 is a plant");
-    let stands = |seen: bool| {
+    // From the start no bead; or one for ten ticks, which moves the belief to `then_um`.
+    let stands = |then_um: Option<f64>| {
         let mut state = ArmingState::default();
         let mut command = 12.0;
         for tick in 0..1000 {
-            // Seen once, and lost again: a person may have brought it to rest here.
-            let position = (seen && tick == 10).then_some(0.0);
             let input = ArmingInput {
-                position_um: position,
+                position_um: (then_um.is_some() && tick < 10).then_some(0.0),
                 framed: true,
                 command_um: command,
-                neutral_um: 20.0,
+                neutral_um: then_um.filter(|_| tick >= 10).unwrap_or(20.0),
                 disturbed: false,
                 steps: 1,
             };
@@ -109,12 +108,19 @@ fn the_pzt_goes_to_the_believed_rest_only_where_no_bead_was_ever_seen() {
                 panic!("given up too soon");
             };
             assert!((next - command).abs() <= 0.1 + 1e-12);
+            assert!(
+                tick >= 50 || next == 12.0,
+                "moved while a bead may come back"
+            );
             command = next;
         }
         command
     };
-    assert_eq!(stands(true), 12.0);
-    assert!((stands(false) - 20.0).abs() < 1e-9);
+    // It rested where a person had brought the PZT.
+    assert_eq!(stands(Some(12.0)), 12.0);
+    // It passed, with the flow of a zero flow at 12.6 um.
+    assert!((stands(Some(12.6)) - 12.6).abs() < 1e-9);
+    assert!((stands(None) - 20.0).abs() < 1e-9);
 }
 
 #[test]

@@ -46,6 +46,27 @@ fn ticks_per_fix(period_us: f64, rate_hz: f64) -> f64 {
     }
 }
 
+/// Key of a model's provenance: the board with which it was identified, by its own description.
+pub const OF_BOARD: &str = "board";
+
+/// Zero flow at which a run with this model begins, um: the newest that was measured on this rig. That is the one of the run before in
+/// this program, else the model's if it was identified with this board. Without either it is the rig file's `first_neutral`.
+///
+/// An emulated rig is a new one in each run: the zero flow of its model is no measurement of it.
+pub(crate) fn first_zero_flow_um(file: &RigFile, model: &Model, board: &str) -> f64 {
+    let of_model = (model.provenance.get(OF_BOARD))
+        .filter(|of| !file.is_emulated() && *of == board)
+        .map(|_| model.working_point_um);
+    let measured_um = (file.rested_um.or(of_model))
+        .filter(|um| (file.limits.low_um..=file.limits.high_um).contains(um));
+    if let (Some(um), None) = (measured_um, file.rested_um) {
+        tracing::info!(
+            "the run begins at {um:.3} um, the zero flow that the model measured with this board"
+        );
+    }
+    measured_um.unwrap_or(file.first_neutral_um)
+}
+
 /// Exposure of a frame, s, if the rig file states it.
 pub fn stated_exposure_s(file: &RigFile) -> Option<f64> {
     match &file.camera {
@@ -80,5 +101,44 @@ pub(crate) fn diffusion_um2_per_s(file: &RigFile, model: &cellpos_plant::Model) 
         file.emulator.diffusion_um2_per_s
     } else {
         model.noise.diffusion_um2_per_s
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rig_file::ActuatorConfig;
+
+    #[test]
+    fn a_run_begins_at_the_zero_flow_that_was_measured_last_on_this_rig() {
+        const BOARD: &str = "PZT board on pzt, serial number 7, firmware 1.0.0";
+        let mut file = RigFile {
+            actuator: toml::from_str::<ActuatorConfig>("kind = \"serial\"\nport = \"pzt\"")
+                .unwrap(),
+            ..RigFile::default()
+        };
+        let mut model = Model {
+            working_point_um: 20.117,
+            ..Model::eq6()
+        };
+        let begins = |file: &RigFile, model: &Model| first_zero_flow_um(file, model, BOARD);
+        // Nothing says that the model was measured here.
+        assert_eq!(begins(&file, &model), 20.0);
+        (model.provenance).insert(OF_BOARD.to_owned(), BOARD.to_owned());
+        assert_eq!(begins(&file, &model), 20.117);
+        let other = Model {
+            provenance: [(OF_BOARD.to_owned(), "another board".to_owned())].into(),
+            ..model.clone()
+        };
+        assert_eq!(begins(&file, &other), 20.0);
+        // The PZT cannot stand there.
+        file.limits.low_um = 20.2;
+        assert_eq!(begins(&file, &model), 20.0);
+        file.limits.low_um = 0.0;
+        file.rested_um = Some(20.19);
+        assert_eq!(begins(&file, &model), 20.19);
+        // An emulated rig is another one in each run.
+        model.working_point_um = 21.0;
+        assert_eq!(begins(&RigFile::default(), &model), 20.0);
     }
 }

@@ -70,6 +70,7 @@ pub mod words;
 pub use devices::Options;
 pub use ended::{EndKind, Ended};
 pub use failure::Failure;
+pub use fit::OF_BOARD;
 pub use frames_seen::{FrameAge, FramesSeen};
 pub use rig::{Armed, Finished, NotArmed, Rig, Running};
 pub use rig_file::RigFile;

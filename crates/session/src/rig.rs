@@ -14,6 +14,7 @@ use crate::setup::{Prepared, ReferenceSpec, Setup, SetupConfig};
 use crate::signals::{self, Place};
 use crate::witness::Witness;
 use cellpos_control::{LearnedTable, Limits, PartnerConfig};
+use cellpos_plant::Model;
 use cellpos_rig::{
     Actuator, ActuatorInfo, ArmRequest, Clock, FrameWatch, PositionSource, SourceInfo,
 };
@@ -170,7 +171,7 @@ impl Rig {
                 displacement_um: self
                     .standing_um()?
                     .unwrap_or(prepared.controller.limits.park_um),
-                neutral_um: self.file.first_neutral_um,
+                neutral_um: self.first_zero_flow_um(&prepared.model),
                 reference,
                 timing: self.file.timing,
                 watchdog_ms: self.watchdog_ms(),
@@ -181,6 +182,11 @@ impl Rig {
             model: prepared.model,
             controller: prepared.controller,
         })
+    }
+
+    /// Zero flow at which a run with this model begins, um.
+    pub fn first_zero_flow_um(&self, model: &Model) -> f64 {
+        fit::first_zero_flow_um(&self.file, model, &self.actuator().name)
     }
 
     /// Silence after which the board is asked to hold, ms.

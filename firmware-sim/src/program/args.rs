@@ -46,7 +46,7 @@ pub(crate) struct Args {
     /// Do not ask for real-time scheduling
     #[arg(long)]
     pub best_effort: bool,
-    /// A new bead appears after the old one has been out of the frame for this long, once the flow is slow
+    /// A new bead appears after the old one has been out of the frame for this long
     #[arg(long, value_name = "TIME", default_value = "300ms")]
     pub new_bead_after: Seconds,
 

@@ -236,7 +236,7 @@ fn allowed(script: &Script, setup: &Prepared, rig: &Rig) -> Result<Check, Failur
             low_um: limits.low_um,
             high_um: limits.high_um,
             slew_um_per_s: limits.slew_um_per_s,
-            neutral_um: file.first_neutral_um,
+            neutral_um: rig.first_zero_flow_um(&setup.model),
             view_um: high_um.min(-low_um),
             sample_s: file.timing.period_us * 1e-6,
             ..CheckLimits::default()

@@ -179,10 +179,8 @@ fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
     let runs = std::fs::read_dir(folder.path().join("runs")).unwrap();
     let began = |run: std::fs::DirEntry| {
         let text = std::fs::read_to_string(run.path().join("run.toml")).ok()?;
-        let line = text
-            .lines()
-            .find(|line| line.starts_with("first_neutral_um"))?;
-        line.split_once(" = ")?.1.parse::<f64>().ok()
+        let run: toml::Table = text.parse().ok()?;
+        run["config"]["neutral_um"].as_float()
     };
     let mut began: Vec<f64> = runs.filter_map(|run| began(run.unwrap())).collect();
     began.sort_by(f64::total_cmp);

@@ -464,3 +464,28 @@ fn a_sine_that_no_loop_can_follow_is_refused_and_every_law_follows_the_others() 
     );
     assert!(!slow.err.contains("predicted"), "{}", slow.err);
 }
+
+#[test]
+fn the_bead_is_found_where_the_zero_flow_has_drifted_since_it_was_measured() {
+    // 1 nm/s over 3 and 7 minutes. At 0.5 um a bead passes faster than the tracker takes it for one.
+    for off_um in [0.2, 0.4, -0.4] {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(
+            folder.path().join("rig.toml"),
+            format!(
+                "[emulator]\nneutral_um = {}\nnew_bead_after_ms = 300.0\n",
+                20.0 + off_um
+            ),
+        )
+        .unwrap();
+        let line =
+            "track --target 0um --duration 5s --clock virtual --frames on --json --rig rig.toml";
+        let r = succeed(folder.path(), line).json();
+        println!("{off_um} um: {} nm", r["rms_true_nm"]);
+        let held_nm = r["rms_true_nm"].as_f64().unwrap();
+        assert!(
+            r["kept"]["why"].is_null() && held_nm < 100.0,
+            "{off_um}: {r}"
+        );
+    }
+}

@@ -161,12 +161,42 @@ fn a_bead_that_was_carried_off_is_replaced_once_the_flow_is_slow() {
         ..quiet()
     };
     let mut world = world(&config);
-    positions(&mut world, 200, 0.0);
+    positions(&mut world, 20, 0.0);
     assert!(!world.bead_in_frame(), "20 um from neutral: 8.5 mm/s");
     positions(&mut world, 300, 20.0);
     assert!(world.bead_in_frame());
     // At 51 um/s or less, dying away with the pole at 76 rad/s, and the slow pole's 3 um/s for 0.3 s.
     assert!(world.bead_um().abs() < 2.0, "{}", world.bead_um());
+}
+
+#[test]
+fn a_flow_that_is_not_slow_brings_the_next_bead_from_upstream_and_carries_it_through() {
+    for away_um in [-1.0_f64, 1.0] {
+        let config = WorldConfig {
+            new_bead_after_ms: Some(100.0),
+            ..quiet()
+        };
+        let mut world = world(&config);
+        // 0.43 mm/s: through the field of 25.6 um in 60 ms.
+        positions(&mut world, 130, 20.0 + away_um);
+        assert!(!world.bead_in_frame());
+        let (mut passed, mut seen_um) = (0, Vec::new());
+        for _ in 0..1000 {
+            let was_in = world.bead_in_frame();
+            positions(&mut world, 1, 20.0 + away_um);
+            if world.bead_in_frame() {
+                seen_um.push(away_um.signum() * world.bead_um());
+            }
+            passed += i32::from(was_in && !world.bead_in_frame());
+        }
+        let ends_um = seen_um
+            .iter()
+            .fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], um| {
+                [low.min(*um), high.max(*um)]
+            });
+        assert!((5..=7).contains(&passed), "{passed} in a second");
+        assert!(ends_um[0] < -12.0 && ends_um[1] > 12.0, "{ends_um:?}");
+    }
 }
 
 #[test]

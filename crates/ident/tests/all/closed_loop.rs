@@ -49,6 +49,7 @@ fn a_held_bead_gives_gain_and_delay_and_says_what_it_cannot_tell() {
         delay_s: 0.002002,
         sd_s: 4e-6,
         half95_s: 8e-6,
+        not_accounted_s: 0.0,
     };
     let start = std::time::Instant::now();
     for p in &m.points {
@@ -135,6 +136,7 @@ fn led_test(seed: u64) -> DelayPrior {
         delay_s: led.delay_s,
         sd_s: led.sd_s,
         half95_s: 0.5 * (led.ci95_s[1] - led.ci95_s[0]),
+        not_accounted_s: led.not_accounted_s,
     }
 }
 

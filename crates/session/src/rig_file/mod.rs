@@ -29,6 +29,9 @@ use std::path::{Path, PathBuf};
 pub struct RigFile {
     /// First estimate of the PZT displacement at which the bead is at rest, um; the loop then finds it.
     pub first_neutral_um: f64,
+    /// Zero flow at the end of the run before on this rig, um: newer than what any file states. It is no key of the file.
+    #[serde(skip)]
+    pub rested_um: Option<f64>,
     /// Of several beads in view, the one nearest to this position at the start is followed, um; left out: the most prominent. The option
     /// `--near` of `track` and `run` overrides it.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -136,6 +139,7 @@ impl Default for RigFile {
     fn default() -> Self {
         Self {
             first_neutral_um: 20.0,
+            rested_um: None,
             near_um: None,
             sample: None,
             actuator: ActuatorConfig::Emulated {},

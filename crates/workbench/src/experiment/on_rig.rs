@@ -14,6 +14,7 @@ use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;
 use cellpos_ident::excitation::ExcitationLimits as ShapeLimits;
 use cellpos_ident::experiment::{Plan, RecordedSegment, Span, Turn};
+use cellpos_ident::identifiability::NOT_ACCOUNTED_S;
 use cellpos_plant::Model;
 use cellpos_record::RunWriter;
 use cellpos_rig::clock::monotonic_ns;
@@ -67,6 +68,8 @@ pub struct Acquired {
     pub trouble: Option<Trouble>,
     /// Folder of the run.
     pub run: Option<String>,
+    /// The board, by its own description.
+    pub board: String,
 }
 
 /// Why segments are missing.
@@ -211,6 +214,7 @@ impl OnRig {
         let mut file = self.file.clone();
         file.partner = None;
         let mut rig = Rig::open(file, self.options())?;
+        let board = rig.actuator().name;
         let mut prepared = Prepared {
             model: self.model.clone(),
             controller: self.controller,
@@ -254,7 +258,7 @@ impl OnRig {
             let now = ended_spans(&ticks, &schedule.spans);
             if now > ended {
                 ended = now;
-                (listener.segment)(&self.acquired(&ticks, plan, &schedule.spans));
+                (listener.segment)(&self.acquired(&ticks, plan, &schedule.spans, &board));
             }
         })?;
         let over = matches!(
@@ -286,7 +290,7 @@ impl OnRig {
         if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
             return Err(other_rate(rate_hz, period_ns));
         }
-        let mut acquired = self.acquired(&ticks, plan, &schedule.spans);
+        let mut acquired = self.acquired(&ticks, plan, &schedule.spans, &board);
         acquired.run = run;
         let (done, of) = (acquired.records.len(), schedule.spans.len());
         acquired.trouble = if done == of {
@@ -314,7 +318,7 @@ impl OnRig {
     }
 
     /// The result of the ticks so far.
-    fn acquired(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span]) -> Acquired {
+    fn acquired(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span], board: &str) -> Acquired {
         let rows = self.rows(ticks);
         let records = spans
             .iter()
@@ -332,6 +336,7 @@ impl OnRig {
             unseen: rows.unseen,
             trouble: None,
             run: None,
+            board: board.to_owned(),
         }
     }
 
@@ -406,6 +411,7 @@ impl OnRig {
         }
         board.led(false).map_err(Failure::failed)?;
         let mut test = DelayTest::evaluate(switched_s, seen)?;
+        test.estimate.not_accounted_s = NOT_ACCOUNTED_S;
         test.line_s = trips_s.get(trips_s.len() / 2).map(|trip_s| 0.5 * trip_s);
         Ok(test)
     }

@@ -18,6 +18,7 @@ use cellpos_ident::sampled::Hold;
 use cellpos_numeric::units::{Hertz, Micrometers, MicrometersPerSecond, Seconds};
 use cellpos_plant::Model;
 use cellpos_rig::Clock;
+use cellpos_session::OF_BOARD;
 use cellpos_session::provenance;
 use cellpos_session::provenance::command_text;
 use cellpos_session::rig_file::ActuatorConfig;
@@ -399,7 +400,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
             args.model, job.seed
         ),
     };
-    let provenance = BTreeMap::from([
+    let mut provenance = BTreeMap::from([
         ("command".to_owned(), command_text()),
         (
             "version".to_owned(),
@@ -415,6 +416,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         ),
         ("rig".to_owned(), rig.clone()),
     ]);
+    provenance.extend(done.board.clone().map(|board| (OF_BOARD.to_owned(), board)));
     let model = Model {
         frame_age_s: Some(done.age_s),
         ..done

@@ -274,7 +274,7 @@ fn go_on_from(file: &mut RigFile, done: &[CycleRow], last: &Path) {
     let rested = done.iter().rev().map(|row| row.neutral_um);
     let within = |um: &f64| (file.limits.low_um..=file.limits.high_um).contains(um);
     if let Some(neutral_um) = rested.into_iter().find(within) {
-        file.first_neutral_um = neutral_um;
+        file.rested_um = Some(neutral_um);
     }
     // Of several beads in view the one that was followed.
     let seen = RunReader::open(last).ok().and_then(|reader| {

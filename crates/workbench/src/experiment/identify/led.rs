@@ -105,7 +105,7 @@ impl DelayTest {
         /// 10.8 degrees at 300 Hz.
         const WORTH_SAYING_S: f64 = 1e-4;
         let [low, high] = self.estimate.ci95_s;
-        let half_s = 0.5 * (high - low);
+        let half_s = 0.5 * (high - low) + self.estimate.not_accounted_s;
         (half_s > WORTH_SAYING_S).then(|| {
             format!(
                 "the LED test leaves the delay open by +-{:.2} ms: the machine or the line stalled too often, or too few edges \

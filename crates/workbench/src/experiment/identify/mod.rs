@@ -69,6 +69,8 @@ pub struct Done {
     pub led: Option<DelayTest>,
     /// PZT displacement at rest, um.
     pub neutral_um: f64,
+    /// The board of a rig, by its own description.
+    pub board: Option<String>,
     /// Mean time from the middle of an exposure to the tick that used it, s: the camera's part of the delay.
     pub age_s: f64,
     /// Folders of the runs on the rig, which replay and report as any other.
@@ -97,6 +99,7 @@ pub fn run_shown(
         records,
         mut led,
         neutral_um,
+        board,
         age_s,
         fix_noise_um,
         mut warnings,
@@ -130,6 +133,7 @@ pub fn run_shown(
         result,
         led,
         neutral_um,
+        board,
         age_s,
         runs,
     })
@@ -155,6 +159,7 @@ struct Raw {
     records: Vec<RecordedSegment>,
     led: Option<DelayTest>,
     neutral_um: f64,
+    board: Option<String>,
     age_s: f64,
     fix_noise_um: Option<f64>,
     warnings: Vec<String>,
@@ -184,6 +189,7 @@ fn held_bead(
         records,
         led,
         neutral_um,
+        board: None,
         age_s,
         fix_noise_um,
         warnings: Vec::new(),
@@ -234,6 +240,7 @@ fn on_rig(
     let mut rig = rig.clone();
     let mut age_s = rig.file.timing.camera_delay_ms * 1e-3;
     let mut fix_noise_um = None;
+    let mut board = None;
     loop {
         let todo = missing(plan, &records, &spoilt);
         if todo.is_empty() {
@@ -259,10 +266,11 @@ fn on_rig(
         };
         if !acquired.records.is_empty() {
             // Where the zero flow has wandered meanwhile the flow is slow and a bead stays in view: the next run begins there.
-            rig.file.first_neutral_um = acquired.neutral_um;
+            rig.file.rested_um = Some(acquired.neutral_um);
         }
         age_s = acquired.age_s.unwrap_or(age_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
+        board = Some(acquired.board);
         runs.extend(acquired.run.clone());
         had_bead |= !acquired.rows.0.is_empty();
         let run_through = matches!(acquired.trouble, Some(Trouble::Spoilt { .. }));
@@ -271,7 +279,7 @@ fn on_rig(
         let done = done.filter(|turn| failed.iter().all(|f| f.index != turn.index));
         warnings.extend(done.map(|turn| {
             format!(
-                "segment {} ({}) flung the bead out of view as planned and is measured at {} of its amplitude",
+                "segment {} ({}) could not be measured twice as planned and is measured at {} of its amplitude",
                 turn.index + 1,
                 plan.segments[turn.index].label,
                 turn.part
@@ -312,7 +320,8 @@ fn on_rig(
     Ok(Raw {
         records,
         led,
-        neutral_um: rig.file.first_neutral_um,
+        neutral_um: rig.file.rested_um.unwrap_or(rig.file.first_neutral_um),
+        board,
         age_s,
         fix_noise_um,
         warnings,
