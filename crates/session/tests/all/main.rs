@@ -4,6 +4,7 @@ mod between_runs;
 mod common;
 mod keeping;
 mod multi_rate;
+mod rig_defaults;
 mod rig_keys;
 mod rig_schema;
 mod rig_walk;

@@ -56,11 +56,18 @@ impl Bound {
         let meta = run.meta().ok()?;
         let setup = recorded::setup(run).ok()?;
         let diffusion_um2_per_s = diffusion_of_run_um2_per_s(meta)?;
-        let used_ms = meta.end.as_ref().and_then(|end| {
-            let frames = end.summary.get("exposure_to_command_us")?;
-            let loop_delay_ms = end.summary.get("loop_delay_ms")?.as_float()?;
-            (frames.get("max")?.as_float()? > 0.0).then_some(loop_delay_ms)
-        });
+        let half_period_ms = 0.5e-3 * setup.config.timing.period_us;
+        let used_ms = match &meta.end {
+            Some(end) => end
+                .summary
+                .get("exposure_to_command_us")
+                .and_then(|frames| {
+                    let loop_delay_ms = end.summary.get("loop_delay_ms")?.as_float()?;
+                    (frames.get("max")?.as_float()? > 0.0).then_some(loop_delay_ms)
+                }),
+            // Of a run without an end: from its rows.
+            None => ticks.age_ms().map(|ms| ms + half_period_ms),
+        };
         let delay_s = connect::delay_of_run_s(&setup, used_ms);
         Some(Self {
             diffusion_um2_per_s,

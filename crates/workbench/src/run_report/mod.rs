@@ -182,13 +182,9 @@ fn nm(um: Option<f64>) -> String {
 fn head(page: &mut Report, sessions: &[Session], ticks: &Ticks, cycles: &[CycleRow]) {
     if let Some(last) = sessions.last() {
         let (status, text) = ending(last);
-        let text = match sessions.len() {
-            1 => format!("The run {text}."),
-            many => format!("The last of {many} sessions {text}."),
-        };
-        // A run that came to its end says so in its result.
-        if sessions.len() > 1 || status != Emphasis::Good {
-            page.note(status, &text);
+        // The result says how a run of one session ended.
+        if let many @ 2.. = sessions.len() {
+            page.note(status, &format!("The last of {many} sessions {text}."));
         }
     }
     let end = |session: &Session| session.meta.as_ref()?.end.clone();

@@ -94,7 +94,10 @@ fn ending(sessions: &[Session]) -> (Emphasis, Option<String>) {
         }
         None => (
             Emphasis::Bad,
-            Some("it was cut off, and reads up to its last flush".to_string()),
+            Some(
+                "its record has no end, because its program was killed or the power failed; what was written before is shown"
+                    .to_string(),
+            ),
         ),
     }
 }
@@ -143,8 +146,8 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
         return of_few_cycles(rows, &rest);
     };
     let mut text = format!(
-        "The cell's stretch (largest length over the {:.2} um at rest) went {}{} over {} cycles{} (means of the first and the last {})",
-        rest.length_um,
+        "The cell's stretch (largest length over the {} um at rest) went {}{} over {} cycles{} (means of the first and the last {})",
+        at_rest(&rest),
         change(&stretch),
         percent(&stretch),
         stretch.cycles,
@@ -171,14 +174,27 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
          straight line.",
         stretch.first.cycles
     );
-    let of_rest = 100.0 * rest.stretch_ci95();
-    if of_rest.is_finite() {
-        sure.push_str(&format!(
-            " The length at rest is known to {of_rest:.2} %, alike for every stretch."
-        ));
-    }
+    sure.push_str(&sure_of_rest(&rest));
     sure.push_str(" One cell does not tell how cells differ.");
     Some(Said { result: text, sure })
+}
+
+/// The length at rest with its 95 % interval, um.
+fn at_rest(rest: &AtRest) -> String {
+    match rest.stretch_ci95() {
+        share if share.is_finite() => with_interval(rest.length_um, share * rest.length_um),
+        _ => format!("{:.2}", rest.length_um),
+    }
+}
+
+/// How sure the length at rest is: the same for every stretch of the run.
+fn sure_of_rest(rest: &AtRest) -> String {
+    match 100.0 * rest.stretch_ci95() {
+        of_rest if of_rest.is_finite() => {
+            format!(" The length at rest is known to {of_rest:.2} %, alike for every stretch.")
+        }
+        _ => " How sure the length at rest is was not measured.".to_string(),
+    }
 }
 
 /// Stretches of time of the static arm, its way to the load and back left out.
@@ -200,12 +216,12 @@ fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<Said> {
     let (first, last) = (stretches.first()?, stretches.last()?);
     Some(Said {
         result: format!(
-            "The cell's stretch (largest length over the {:.2} um at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles{}.",
-            rest.length_um,
+            "The cell's stretch (largest length over the {} um at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles{}.",
+            at_rest(rest),
             stretches.len(),
             disturbed(rows.iter().filter(super::fatigue::is_whole))
         ),
-        sure: "so few cycles have no interval.".to_string(),
+        sure: format!("so few cycles have no interval.{}", sure_of_rest(rest)),
     })
 }
 

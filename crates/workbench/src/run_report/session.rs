@@ -144,7 +144,7 @@ pub(super) fn ending(session: &Session) -> (Emphasis, String) {
         Some(end) => (Emphasis::Warning, format!("ended: {}", end.outcome)),
         None => (
             Emphasis::Bad,
-            "was cut off: it reads up to its last flush".to_string(),
+            "has no end: its program was killed, or the power failed".to_string(),
         ),
     }
 }

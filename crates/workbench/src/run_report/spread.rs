@@ -47,6 +47,22 @@ impl Spread {
         narrow.map_or(self.kept.len() as u64, |narrow| narrow.counts.iter().sum())
     }
 
+    /// The value that half of them are above, within a narrow bin.
+    pub(super) fn median(&self) -> Option<f64> {
+        if let Some(narrow) = &self.narrow {
+            let half = self.count() / 2;
+            let mut seen = 0;
+            let place = narrow.counts.iter().position(|count| {
+                seen += count;
+                seen > half
+            })?;
+            return Some(narrow.start + (place as f64 + 0.5) * narrow.width);
+        }
+        let mut kept = self.kept.clone();
+        kept.sort_by(f64::total_cmp);
+        kept.get(kept.len() / 2).copied()
+    }
+
     /// Smallest and largest value.
     pub(super) fn ends(&self) -> Option<(f64, f64)> {
         if let Some(narrow) = &self.narrow {

@@ -75,6 +75,9 @@ pub(super) struct Ticks {
     session: u64,
     pub wake_us: Decades,
     pub compute_us: Decades,
+    /// From the middle of an exposure to the command computed from it, ms.
+    age_ms: Spread,
+    newest_frame: u64,
     /// Sum and number of the stated variances of positions.
     variance_um2: (f64, u64),
     start_s: f64,
@@ -123,6 +126,11 @@ impl Ticks {
         self.end_s = time_s;
         self.wake_us.add(f64::from(r.wake_ns) * 1e-3);
         self.compute_us.add(f64::from(r.compute_ns) * 1e-3);
+        if std::mem::replace(&mut self.newest_frame, r.frame_id) != r.frame_id {
+            let handed_ns = r.time_ns + i64::from(r.compute_ns);
+            self.age_ms
+                .add((handed_ns - r.mid_exposure_ns) as f64 * 1e-6);
+        }
         self.length.add(time_s, [r.length_um]);
         if r.length_um.is_finite() {
             self.has_length = true;
@@ -255,6 +263,11 @@ impl Ticks {
         } else {
             1e-3
         }
+    }
+
+    /// Median time from the middle of an exposure to the command computed from it, ms.
+    pub(super) fn age_ms(&self) -> Option<f64> {
+        self.age_ms.median()
     }
 
     /// Localisation noise as stated, um RMS.
