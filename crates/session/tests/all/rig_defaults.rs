@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::Value;
 
 /// Each table of each kind with the keys that it cannot do without, and no other.
-const LEAST: [&str; 14] = [
+const LEAST: [&str; 13] = [
     "",
     "[actuator]\nkind = \"serial\"\nport = \"p\"\n",
     "[actuator]\nkind = \"program\"\nsocket = \"p\"\n",
@@ -18,7 +18,6 @@ const LEAST: [&str; 14] = [
     "[tracking]\n[cell]\n[emulator.cell]\n",
     "[vision]\nwindow_px = 21\nprofile = { kind = \"ring\", edge_px = 5.0 }\n",
     "[vision]\nwindow_px = 21\nprofile = { kind = \"gaussian\", sigma_px = 5.0 }\n",
-    "[vision]\nwindow_px = 21\nprofile = { kind = \"table\", radius_px = 5.0, knot_px = 1.0, values = [1.0] }\n",
     "[vision]\nwindow_px = 21\nprofile = { kind = \"ring\", edge_px = 5.0 }\n[vision.learning]\n",
     "[vision]\nwindow_px = 21\nprofile = { kind = \"ring\", edge_px = 5.0 }\n\
      noise = { kind = \"known\", read_sd_grey = 1.0, shot_grey_per_electron = 1.0, black_level_grey = 0.0 }\n",
@@ -57,7 +56,11 @@ fn of_file(text: &str) -> Values {
 /// What the types fill in, and which keys they do not do without.
 fn defaults() -> (Values, BTreeSet<String>) {
     let (mut filled, mut needed) = (Values::new(), BTreeSet::new());
-    for text in LEAST {
+    let values = "0.0, ".repeat(32);
+    let table = format!(
+        "[vision]\nwindow_px = 21\nprofile = {{ kind = \"table\", radius_px = 5.0, knot_px = 1.0, values = [{values}] }}\n"
+    );
+    for text in LEAST.into_iter().chain([table.as_str()]) {
         let mut given = Values::new();
         gather(
             "",
