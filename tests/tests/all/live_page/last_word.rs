@@ -50,7 +50,8 @@ fn signal(run: &Watched, signal: &str) {
 #[test]
 #[ignore = "needs chromium and chromium-driver: .ci/run installs them and runs this"]
 fn a_run_that_comes_to_its_end_says_so_and_it_stays() {
-    let (_folder, page, run) = start(PATIENT, "--duration 4s");
+    // Long enough for a busy browser to come in time.
+    let (_folder, page, run) = start(PATIENT, "--duration 15s");
     assert!(run.ended().success());
     let [state, word, reason, _, pzt] = when_gone(&page);
     assert_eq!((state.as_str(), word.as_str()), ("over", "run over"));
@@ -130,6 +131,8 @@ fn the_picture_is_most_of_the_page_on_every_screen_and_every_theme() {
         );
         // Some seconds of traces.
         page.wait_for("return +document.body.dataset.held > 3", programs::PATIENCE);
+        // As a fault leaves the page: held.
+        page.run("document.getElementById('hold').click()");
         for theme in ["light", "dark", "red"] {
             page.run(&format!(
                 "document.documentElement.dataset.theme = '{theme}'"

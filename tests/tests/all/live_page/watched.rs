@@ -12,9 +12,10 @@ use std::time::{Duration, Instant};
 pub(super) const RUNNING: &str = "return document.body.dataset.state === 'running'";
 
 /// A rig file for what is shown in a browser. The browser shares the machine with the loop: frames may be old and ticks late for seconds, in
-/// arming, too. The tables that are left out are emulated.
+/// arming, too, and a bead that drifts has left the view before a busy machine begins to look. The tables that are left out are emulated.
 pub(super) const PATIENT: &str = "first_neutral_um = 20.0\n[timing]\noldest_ms = 1000.0\nfaults_in_a_row = 100000\n\
-     budget_us = 1000.0\nlost_ticks = 20000\n[arming]\ncheck = false\n";
+     budget_us = 1000.0\nlost_ticks = 20000\n[arming]\ncheck = false\npatience_ticks = 20000\n\
+     [emulator]\nideal = true\ndrift_um_per_s = 0.0\n";
 
 /// A command with a live page.
 pub(super) struct Watched {
