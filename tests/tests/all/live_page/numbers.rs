@@ -1,6 +1,6 @@
 //! Every number on the page is the record's at the same tick.
 
-use super::watched::{RUNNING, Watched, only_run, says_the_summary};
+use super::watched::{RUNNING, Watched, only_run, says_the_summary, shows};
 use cellpos_tests::browser::Browser;
 use cellpos_tests::programs;
 use serde_json::Value;
@@ -116,6 +116,8 @@ fn every_number_on_the_page_is_the_records_at_the_same_tick() {
         std::thread::sleep(Duration::from_millis(200));
     }
     page.click("park");
+    // The PZT is parked and the page says so; the program then still writes the table of all ticks.
+    shows(&page, "state", "stopped");
     run.ended();
     let rows = record(folder.path(), "numbers");
     let (found, summary) = only_run(folder.path());

@@ -79,16 +79,21 @@ impl Watched {
         }
     }
 
+    /// Waits for the end of the program. It may take its time as long as it works: a table of all ticks is written at the end.
     pub(super) fn ended(mut self) -> ExitStatus {
-        let deadline = Instant::now() + programs::PATIENCE;
+        let mut deadline = Instant::now() + programs::PATIENCE;
+        let mut worked = String::new();
         loop {
             if let Some(status) = self.child.try_wait().expect("a child") {
                 return status;
             }
+            let threads = threads(self.child.id());
+            if threads != worked && threads.contains("cellpos-finish") {
+                (deadline, worked) = (Instant::now() + programs::PATIENCE, threads.clone());
+            }
             assert!(
                 Instant::now() < deadline,
-                "the run did not end; its threads: {}",
-                threads(self.child.id())
+                "the run did not end; its threads: {threads}"
             );
             std::thread::sleep(Duration::from_millis(20));
         }
