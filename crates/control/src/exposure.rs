@@ -26,16 +26,17 @@ const PAST: usize = 24;
 pub(crate) struct Past {
     /// At this tick and those before, newest first, um.
     positions_um: [f64; PAST],
-    /// Jump at the tick before each of them, um.
-    jumps_um: [f64; PAST],
+    /// Sum of all jumps up to each of them, um.
+    jumped_um: [f64; PAST],
 }
 
 impl Past {
     /// A tick on: the position now, and the jump with which the tick began, um.
     pub(crate) fn push(&mut self, position_um: f64, jump_um: f64) {
+        let jumped_um = self.jumped_um[0] + jump_um;
         for (series, newest_um) in [
             (&mut self.positions_um, position_um),
-            (&mut self.jumps_um, jump_um),
+            (&mut self.jumped_um, jumped_um),
         ] {
             series.copy_within(0..PAST - 1, 1);
             series[0] = newest_um;
@@ -49,13 +50,15 @@ impl Past {
 
     /// Position `ago` ticks ago, um.
     fn at(&self, ago: f64) -> Option<f64> {
-        let newer = ago.max(0.0).floor();
-        let (part, newer) = (ago.max(0.0) - newer, newer as usize);
-        let (a, b) = (
-            self.positions_um.get(newer)?,
-            self.positions_um.get(newer + 1)?,
-        );
-        Some(a + part * (b + self.jumps_um.get(newer)? - a))
+        Some(self.without_jumps(ago)? + self.jumped_um.get(ago.max(0.0) as usize)?)
+    }
+
+    /// The same without the jumps, from an arbitrary zero: a path that bends at the ticks, um.
+    pub(crate) fn without_jumps(&self, ago: f64) -> Option<f64> {
+        let newer = ago.max(0.0) as usize;
+        let part = ago.max(0.0) - newer as f64;
+        let at = |k: usize| Some(self.positions_um.get(k)? - self.jumped_um.get(k)?);
+        Some((1.0 - part) * at(newer)? + part * at(newer + 1)?)
     }
 
     /// What a frame shows whose exposure of `exposure` ticks has its middle `age` ticks ago, um; `None` if that is longer ago than is kept.

@@ -5,13 +5,15 @@
 //! explains it best (change-point detection by Bayes). So a change is found as soon as it explains the fixes better than chance does at the
 //! stated rate of changes, and there is no search that could raise a false alarm.
 
-use super::motion::{LAGS, MEMBERS};
 use std::f64::consts::LN_2;
 
-/// Step of the delays, samples: that of the law's tunings.
-const STEP: f64 = 0.5;
-/// Delays beyond the design's: those between the first and the last lag of the instrument.
-pub(super) const DELAYS: usize = ((LAGS[MEMBERS - 1] - LAGS[0]) / STEP) as usize + 1;
+/// Delays beyond the design's, samples: half a sample beyond those of the law's tunings at the upper end, so that a delay that is too long
+/// for the law is found.
+const LEAST: f64 = -1.0;
+const MOST: f64 = 2.0;
+/// Their step. A delay that is off by half of it takes at most as large a part from the gain: half of a change that is reported.
+const STEP: f64 = 0.125;
+const DELAYS: usize = ((MOST - LEAST) / STEP) as usize + 1;
 /// Random walk of the logarithm of a plant's gain, 1/sqrt(s). A channel that clogs to half in a quarter of an hour is then followed
 /// within half a standard deviation of the estimate. A gain that does not drift is inside for 99 % in the long run, whatever the walk
 /// is: the drift is half of the stated variance.
@@ -29,8 +31,8 @@ const MOVES_S: f64 = 20.0;
 const MOVING: usize = 0;
 
 /// A delay of the belief beyond the design's, samples.
-pub(super) fn delay_at(d: usize) -> f64 {
-    LAGS[0] + STEP * d as f64
+fn delay_at(d: usize) -> f64 {
+    LEAST + STEP * d as f64
 }
 
 /// What a block of fixes tells of the gain `g` if the delay is known: the logarithm of its likelihood is `score g - information g^2 / 2`.
@@ -56,8 +58,8 @@ pub(super) struct Finding {
 }
 
 impl Finding {
-    /// Logarithm of the odds that the delay is longer and that it is shorter than one of the law's, samples.
-    pub(super) fn delay_odds(&self, delay: f64) -> [f64; 2] {
+    /// Logarithm of the odds that the delay is longer and that it is shorter than `delay` by more than `by`, samples.
+    pub(super) fn delay_odds(&self, delay: f64, by: f64) -> [f64; 2] {
         let odds = |part: &dyn Fn(f64) -> bool| {
             let mut sums = [f64::MIN_POSITIVE; 2];
             for (d, p) in self.delays.iter().enumerate() {
@@ -65,10 +67,7 @@ impl Finding {
             }
             (sums[1] / sums[0]).ln()
         };
-        [
-            odds(&|off| off > 0.5 * STEP),
-            odds(&|off| off < -0.5 * STEP),
-        ]
+        [odds(&|off| off > by), odds(&|off| off < -by)]
     }
 }
 
@@ -167,6 +166,8 @@ impl Belief {
     fn onward(&mut self, seconds: f64) {
         let change = CHANGES_PER_S * seconds;
         let settles = seconds / MOVES_S;
+        // The delay wanders as the gain does: by a sample where the gain would by all of it.
+        let wanders = 0.5 * (GAIN_WALK / STEP).powi(2) * seconds;
         let prior = self.prior;
         let all: Span = std::array::from_fn(|d| self.delay(d));
         let unknown = |d: usize| Part::unknown(change * (all[d].probability + prior[d]));
@@ -181,22 +182,32 @@ impl Belief {
                 MOVING => (change, settles, GAIN_PRIOR / MOVES_S.sqrt()),
                 _ => (0.0, change, GAIN_WALK),
             };
-            for ((part, all), prior) in span.iter_mut().zip(all).zip(prior) {
-                let same = part.times(1.0 - 3.0 * change - ends);
-                let others = [all.times(begins), any.times(change * prior)];
-                *part = Part::sum(std::iter::once(same).chain(others));
+            let before = *span;
+            for (d, part) in span.iter_mut().enumerate() {
+                let beside = [d.wrapping_sub(1), d + 1]
+                    .into_iter()
+                    .filter(|&e| prior.get(e).is_some_and(|p| *p > 0.0));
+                let stays = 1.0 - 3.0 * change - ends - wanders * beside.clone().count() as f64;
+                let same = [
+                    part.times(stays),
+                    all[d].times(begins),
+                    any.times(change * prior[d]),
+                ];
+                let moved = beside.map(|e| before[e].times(wanders));
+                *part = Part::sum(same.into_iter().chain(moved));
                 part.variance += (walk * part.gain).powi(2) * seconds;
             }
         }
     }
 
     /// A block of fixes over this time, as each delay explains it. What is known then.
-    pub(super) fn observe(&mut self, block: &[Likelihood; DELAYS], seconds: f64) -> Finding {
+    pub(super) fn observe(&mut self, block: impl Fn(f64) -> Likelihood, seconds: f64) -> Finding {
+        let block: [Likelihood; DELAYS] = std::array::from_fn(|d| block(delay_at(d)));
         self.onward(seconds);
         let mut logs = [[f64::NEG_INFINITY; DELAYS]; SPANS];
         let mut most = f64::NEG_INFINITY;
         for (span, logs) in self.spans.iter_mut().zip(&mut logs) {
-            for ((part, log), block) in span.iter_mut().zip(logs).zip(block) {
+            for ((part, log), block) in span.iter_mut().zip(logs).zip(&block) {
                 if part.probability > 0.0 {
                     *log = part.observe(*block) + part.probability.ln();
                     most = most.max(*log);
@@ -219,7 +230,7 @@ impl Belief {
             score: information * gain,
             information,
         };
-        self.observe(&[measured; DELAYS], 0.0);
+        self.observe(|_| measured, 0.0);
     }
 
     fn finding(&self) -> Finding {

@@ -1,16 +1,16 @@
 //! Evidence of gain and delay: moments of the whitened fixes with the whitened motion that was chosen.
 //!
-//! Let `j` be lags around the design's delay, `x_j` the whitened motion of the model under the dither and the reference, `p_j` that under
+//! Let `j` be lags at whole ticks, `x_j` the whitened motion of the model under the dither and the reference, `p_j` that under
 //! all commands, and `y` the whitened fix. `x` does not depend on the fixes, so it is independent of the disturbance:
 //! `sum x_i y = gain * sum x_i p_j e_j(delay)`, plus a term with the variance of the products `x r`, where `r` is the residual of `y`.
 //! That variance is measured in blocks that are longer than the correlation of `x`, so it includes the colour of the disturbance.
 
-use super::belief::{Belief, Finding, Likelihood, delay_at};
-use super::motion::{LAGS, MEMBERS};
+use super::belief::{Belief, Finding, Likelihood};
+use super::motion::{Frame, MEMBERS};
 
 /// Fixes of a block. Whitened binary dither is correlated with itself over 3 ticks; a block of five times that has all but a tenth of
 /// the correlation of neighbouring products.
-const BLOCK: u32 = 16;
+pub(super) const BLOCK: u32 = 16;
 /// Memory of all that is known of the noise, and of how the commands follow the motion that was chosen, fixes: two seconds at 1 kHz. The
 /// variance of the products is then known to 6 %.
 pub(super) const MEMORY_FIXES: f64 = 2048.0;
@@ -18,7 +18,8 @@ const MEMORY: f64 = MEMORY_FIXES / BLOCK as f64;
 /// Standard deviation of the commanded motion over the chosen motion, a lag, before it was seen. The loop leaves the dither alone, so it
 /// answers what a wrong gain makes of it only: half of that in a tick, and the gain is wrong by half.
 const ANSWER: f64 = 0.25;
-/// Blocks from which the noise of a block is known. It is integrated out: a block is one of Student's distribution.
+/// Blocks from which the noise of a block is known: the degrees of freedom. It is integrated out, so a block is one of Student's
+/// distribution with as many dimensions as there are lags.
 const SCALE_BLOCKS: f64 = 8.0;
 
 /// Part of a mean of the noise that a new one of `count` values makes up, with a memory of `memory` values. What the design states counts as
@@ -29,11 +30,6 @@ pub(super) fn part(count: f64, memory: f64) -> f64 {
 
 type Vector = [f64; MEMBERS];
 type Matrix = [Vector; MEMBERS];
-
-/// Weights of the lags for a delay, samples.
-pub(super) fn weights(delay: f64) -> Vector {
-    std::array::from_fn(|j| (1.0 - (delay - LAGS[j]).abs()).max(0.0))
-}
 
 pub(super) fn dot(a: &Vector, b: &Vector) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
@@ -139,19 +135,20 @@ impl Evidence {
     }
 
     /// At the end of a block, which `fix_s` from fix to fix have made. `believed` is the gain and delay by which the noise is judged.
-    pub(super) fn conclude(&mut self, fix_s: f64, (gain, delay): (f64, f64)) {
+    pub(super) fn conclude(&mut self, fix_s: f64, frame: &Frame, (gain, delay): (f64, f64)) {
         let block = std::mem::take(&mut self.block);
         self.fixes = 0;
         let Some(l) = cholesky(&block.xx) else {
             return;
         };
-        let e = weights(delay);
+        let e = frame.of(delay);
         let left: Vector = std::array::from_fn(|i| block.xy[i] - gain * dot(&block.xp[i], &e));
         let white = forward(&l, &left);
         let left_um2 = dot(&white, &white) / MEMBERS as f64;
         self.blocks += 1.0;
         let scale = self.blocks.min(SCALE_BLOCKS);
-        let weight = (scale + 1.0) / (scale * self.noise_um2 + left_um2);
+        let members = MEMBERS as f64;
+        let weight = (scale + members) / (scale * self.noise_um2 + members * left_um2);
         self.noise_um2 += (left_um2 - self.noise_um2) / (scale + 1.0);
         let part = part(self.blocks, MEMORY);
         // The commands answer the disturbance, so their products in this block correlate with its noise. How they follow the motion that was
@@ -163,13 +160,13 @@ impl Evidence {
         self.answer_um2 += part * (answer_um2 - self.answer_um2);
         let answer = self.recent.answer(self.answer_um2);
         let commanded = |delay: f64| -> Vector {
-            let e = weights(delay);
+            let e = frame.of(delay);
             std::array::from_fn(|i| dot(&answer[i], &e))
         };
         let before = commanded(delay);
         let score: Vector = std::array::from_fn(|i| left[i] + gain * dot(&block.xx[i], &before));
-        let likelihood = |d: usize| {
-            let by = commanded(delay_at(d));
+        let likelihood = |delay: f64| {
+            let by = commanded(delay);
             let moved: Vector = std::array::from_fn(|i| dot(&block.xx[i], &by));
             Likelihood {
                 score: weight * dot(&by, &score),
@@ -177,8 +174,7 @@ impl Evidence {
             }
         };
         let seconds = f64::from(BLOCK) * fix_s;
-        let likelihoods = std::array::from_fn(likelihood);
-        self.found = Some(self.belief.observe(&likelihoods, seconds));
+        self.found = Some(self.belief.observe(likelihood, seconds));
         self.recent.take(&block);
     }
 }
@@ -233,6 +229,11 @@ mod tests {
             let mut random = Random::new(seed);
             let mut evidence = Evidence::new(-2.0, 1e-3);
             let mut x_um = [0.0; MEMBERS];
+            let frame = Frame {
+                first: 0.0,
+                jump: 0.0,
+                exposure: 0.0,
+            };
             let (mut wander_um, mut side_um) = (0.0, 0.0);
             let mut farthest = 0.0_f64;
             for fix in 0..20_000 {
@@ -251,7 +252,7 @@ mod tests {
                     weight: 1.0,
                 });
                 if complete {
-                    evidence.conclude(1e-3, (1.0, 0.0));
+                    evidence.conclude(1e-3, &frame, (1.0, 0.0));
                     let answer = evidence.recent.answer(evidence.answer_um2);
                     for (i, row) in answer.iter().enumerate() {
                         for (j, part) in row.iter().enumerate() {

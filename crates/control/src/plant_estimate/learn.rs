@@ -1,7 +1,7 @@
 //! A fix enters the estimate.
 
-use super::evidence::{Products, dot, weights};
-use super::motion::MEMBERS;
+use super::evidence::{Products, dot};
+use super::motion::{Alignment, MEMBERS};
 use super::retuning::DELAYS;
 use super::whiten::Whitener;
 use super::{AdaptState, Adapter};
@@ -67,19 +67,25 @@ impl Now {
 impl Adapter {
     /// One tick of the regression. Whether something was learned.
     pub(super) fn learn(&self, state: &mut AdaptState, fix: Option<Fix>) -> bool {
-        let (delay, exposure) = (self.delay_samples, self.exposure_ticks);
+        let delay = self.delay_samples;
         state.since_fix += 1.0;
         let known = fix.and_then(|fix| {
-            let at_um = state.model.at(&fix, delay, exposure)?;
-            Some((fix, at_um, state.instrument.at(&fix, delay, exposure)?))
+            let age = fix.age as f64 + fix.offset;
+            let aligned = state.aligned.get_or_insert(Alignment::begin(delay, age));
+            if !aligned.follow(delay, age) {
+                *aligned = Alignment::begin(delay, age);
+                state.seen = None;
+            }
+            let at_um = state.model.at(aligned, age)?;
+            let chosen_um = state.instrument.at(aligned, age)?;
+            Some((fix, age, self.frame(aligned.first(delay)), at_um, chosen_um))
         });
-        let Some((fix, at_um, chosen_um)) = known else {
+        let Some((fix, ago, frame, at_um, chosen_um)) = known else {
             state.silent = state.silent.saturating_add(1);
             return false;
         };
         state.silent = 0;
         // From exposure to exposure, whenever the ticks were that used them.
-        let ago = fix.age as f64 + fix.offset;
         let apart = state.since_fix - ago;
         state.since_fix = ago;
         let usual_um2 = state.colour.usual_um2();
@@ -102,7 +108,7 @@ impl Adapter {
         let scale = correction.weight;
         let (y, p, x) = (scale * y, p.map(|v| scale * v), x.map(|v| scale * v));
         let (gain, late) = (state.force.log_gain.exp(), DELAYS[state.force.member]);
-        let in_force = dot(&p, &weights(late));
+        let in_force = dot(&p, &frame.of(late));
         state.now.add(y, in_force);
         let rise = (state.now.rise(gain, usual_um2)).min(ENOUGH - state.force.log_gain);
         if rise > 0.0 {
@@ -117,14 +123,15 @@ impl Adapter {
             Some(found) => (found.gain.max(0.0), found.delay),
             None => (gain, late),
         };
-        let moved = |p: &[f64; MEMBERS]| believed.0 * dot(p, &weights(believed.1));
+        let believed_frame = frame.of(believed.1);
+        let moved = |p: &[f64; MEMBERS]| believed.0 * dot(p, &believed_frame);
         let far = (y - moved(&p)).abs() / (FAR * usual_um2.sqrt());
         // The error of the model along a reference is not a line.
         let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
         if chosen_um * chosen_um < usual_um2 {
             let left_um = (y - gain * in_force) / gain;
             let noise_um2 = state.colour.white_um2 / (gain * gain);
-            let shown_ago = delay + late + fix.age as f64 + fix.offset;
+            let shown_ago = delay + late + ago;
             let left = (left_um, noise_um2);
             (state.lines).learn(&self.lines, &self.whitener, left, shown_ago);
         }
@@ -145,7 +152,7 @@ impl Adapter {
         if complete {
             state.colour.solve();
             let fix_s = self.interval * self.sample_s;
-            state.evidence.conclude(fix_s, believed);
+            state.evidence.conclude(fix_s, &frame, believed);
         }
         true
     }

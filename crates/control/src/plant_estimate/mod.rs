@@ -30,7 +30,7 @@ use colour::Colour;
 use dither::Dither;
 use evidence::Evidence;
 use lines::{LineSettings, Lines};
-use motion::Motion;
+use motion::{Alignment, Frame, Motion};
 pub use retuning::{AdaptMode, AdaptNews};
 use retuning::{DELAYS, INTERVAL, NOMINAL, REPORTED_GAIN, Retuning, TUNINGS};
 use serde::Serialize;
@@ -80,6 +80,8 @@ pub(crate) struct Adapter {
     whitener: Whitener,
     /// Whole and fractional samples of the design's delay.
     delay_samples: f64,
+    /// Time in which the speed moves the bead as far as the jump does, ticks.
+    jump: f64,
     sample_s: f64,
     /// Ticks from one fix to the next, and those in a row that may be without one.
     interval: f64,
@@ -97,6 +99,8 @@ pub struct AdaptState {
     /// The model, driven with all commands, and with those that were chosen.
     model: Motion,
     instrument: Motion,
+    /// `None` before the series began.
+    aligned: Option<Alignment>,
     dither: Dither,
     seen: Option<Track>,
     /// Of the filter of all series, and ticks since the exposure of the last fix that it took.
@@ -159,6 +163,7 @@ impl Adapter {
             lines: LineSettings::new(ts, config.ticks_per_fix),
             forward: FeedForward::new(&model),
             delay_samples: model.delay_samples(),
+            jump: model.feedthrough * model.gain_per_s.signum() / moves,
             sample_s: ts,
             interval: config.ticks_per_fix,
             planned_gap: config.planned_gap(),
@@ -171,6 +176,7 @@ impl Adapter {
         AdaptState {
             model: Motion::start(command_um),
             instrument: Motion::start(0.0),
+            aligned: None,
             dither: Dither::new(),
             seen: None,
             covariance: self.whitener.settled(),
@@ -251,6 +257,15 @@ impl Adapter {
         let delay = self.delay_samples + DELAYS[state.force.member] + age;
         let seen = state.dither.motion.seen(delay, self.exposure_ticks);
         state.force.log_gain.exp() * seen.unwrap_or(0.0)
+    }
+
+    /// What a frame shows of the lags, with the design's delay at `first`.
+    fn frame(&self, first: f64) -> Frame {
+        Frame {
+            first,
+            jump: self.jump,
+            exposure: self.exposure_ticks,
+        }
     }
 
     /// Where it stands.

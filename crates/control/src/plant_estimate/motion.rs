@@ -1,14 +1,83 @@
 //! A model driven by the commands, and the innovations of its motion.
 
+use super::evidence::BLOCK;
 use super::whiten::{Correction, Track, Whitener};
-use crate::estimator::{Estimator, Fix, PredictedState};
-use crate::exposure::Past;
+use crate::estimator::{Estimator, PredictedState};
+use crate::exposure::{Past, mean};
 
-/// Lags of the instrument beyond the design's delay, samples. A position between two ticks is on the line through them, so that
-/// any delay between the first and the last is in their span.
-pub(super) const LAGS: [f64; MEMBERS] = [-1.0, 0.0, 1.0, 2.0];
-/// How many.
-pub(super) const MEMBERS: usize = 4;
+/// Lags of the series, samples, from the tick that [`Alignment`] gives.
+pub(super) const LAGS: [f64; MEMBERS] = [-1.0, 0.0, 1.0, 2.0, 3.0];
+/// How many: any of the delays that are looked for, from any time between two ticks.
+pub(super) const MEMBERS: usize = 5;
+
+/// Where the exposures are between the ticks.
+///
+/// The model's path bends at the ticks only. A position between two ticks is on the line through both, so series at whole ticks span
+/// every delay. Series at any other times do not: the line through two points with a bend between them leaves the path, and a gain
+/// would come out too large. The path jumps at the ticks as well if the plant has a direct feedthrough. A jump is as far as the speed
+/// moves the bead in a part of a tick, so the line through the positions without jumps, taken that part further, has it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Alignment {
+    /// Age of a fix that is usual, and whole ticks from its exposure to lag 0, ticks.
+    usual: f64,
+    whole: f64,
+}
+
+impl Alignment {
+    /// By a fix of this age, for a design with this delay, ticks.
+    pub(super) fn begin(delay: f64, age: f64) -> Self {
+        Self {
+            usual: age,
+            whole: (delay + age).floor(),
+        }
+    }
+
+    /// Takes the age of a fix into the usual one, over a block of fixes. Whether the series still have the usual fix within half a tick.
+    #[must_use]
+    pub(super) fn follow(&mut self, delay: f64, age: f64) -> bool {
+        self.usual += (age - self.usual).clamp(-0.5, 0.5) / f64::from(BLOCK);
+        (self.first(delay) - 0.5).abs() < 1.0
+    }
+
+    /// Where the design's delay is among the lags, samples.
+    pub(super) fn first(&self, delay: f64) -> f64 {
+        delay + self.usual - self.whole
+    }
+
+    /// Age of the model's position for a lag and a fix of this age, ticks.
+    fn ago(&self, lag: f64, age: f64) -> f64 {
+        self.whole + lag + age - self.usual
+    }
+}
+
+/// What a frame shows, as a sum over the series of the lags.
+pub(super) struct Frame {
+    /// Where the design's delay is among the lags, ticks.
+    pub first: f64,
+    /// Time in which the speed moves the bead as far as the jump does, ticks.
+    pub jump: f64,
+    /// Exposure, ticks.
+    pub exposure: f64,
+}
+
+impl Frame {
+    /// Weights of the series for a delay beyond the design's, samples. A delay beyond the lags counts as the last one.
+    pub(super) fn of(&self, delay: f64) -> [f64; MEMBERS] {
+        let lag = (self.first + delay - LAGS[0]).clamp(0.0, (MEMBERS - 1) as f64);
+        let weight = |j: usize| {
+            mean(lag, self.exposure, |lag| {
+                let before = lag.floor().min((MEMBERS - 2) as f64);
+                let part = lag - before - self.jump;
+                Some(match j as f64 - before {
+                    0.0 => 1.0 - part,
+                    1.0 => part,
+                    _ => 0.0,
+                })
+            })
+        };
+        std::array::from_fn(|j| weight(j).unwrap_or(0.0))
+    }
+}
 
 /// The model and its recent positions, and each delay's series in the filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,12 +122,11 @@ impl Motion {
         self.past.seen(delay, exposure)
     }
 
-    /// The same for each lag beyond `delay`, ticks.
-    pub(super) fn at(&self, fix: &Fix, delay: f64, exposure: f64) -> Option<[f64; MEMBERS]> {
-        let ago = delay + fix.age as f64 + fix.offset;
+    /// Positions without jumps for each lag and a fix of this age, ticks.
+    pub(super) fn at(&self, aligned: &Alignment, age: f64) -> Option<[f64; MEMBERS]> {
         let mut at_um = [0.0; MEMBERS];
         for (at, lag) in at_um.iter_mut().zip(LAGS) {
-            *at = self.seen(ago + lag, exposure)?;
+            *at = self.past.without_jumps(aligned.ago(lag, age))?;
         }
         Some(at_um)
     }

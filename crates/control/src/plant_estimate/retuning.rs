@@ -3,7 +3,7 @@
 //! Towards caution (more gain than tuned for) at once, towards boldness slowly. While the tuning is within the interval of the estimate it
 //! settles there.
 
-use super::belief::{self, Finding};
+use super::belief::Finding;
 use serde::Serialize;
 
 /// Where the tuning stands.
@@ -25,8 +25,9 @@ pub enum AdaptMode {
 
 /// Delays that the law can be tuned to, beyond the design's, samples.
 pub(super) const DELAYS: [f64; TUNINGS] = [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5];
-/// How many: those of the belief but its last, which is more than the law can be tuned to.
-pub(super) const TUNINGS: usize = belief::DELAYS - 1;
+/// How many, and half the step between two.
+pub(super) const TUNINGS: usize = 6;
+const HALF_STEP: f64 = 0.25;
 /// The design's own among them.
 pub(super) const NOMINAL: usize = 2;
 /// Largest gain over the design's that the law is tuned to, and largest design's over the gain.
@@ -148,7 +149,7 @@ impl Retuning {
     }
 
     fn follow_delay(&mut self, found: &Finding, usable: &[bool; TUNINGS]) -> DelayStep {
-        let [longer, shorter] = found.delay_odds(DELAYS[self.member]);
+        let [longer, shorter] = found.delay_odds(DELAYS[self.member], HALF_STEP);
         let next = if longer > DELAY_SURE {
             self.member + 1
         } else if shorter > DELAY_SURE {
@@ -185,7 +186,7 @@ impl Retuning {
         let farther = 0.5 * REPORTED_GAIN + INTERVAL * before.log_sd + sure;
         let gain = change > farther;
         let surely_not = |member: usize, sure: f64| {
-            let [longer, shorter] = found.delay_odds(DELAYS[member]);
+            let [longer, shorter] = found.delay_odds(DELAYS[member], HALF_STEP);
             longer.max(shorter) > sure
         };
         let delay = surely_not(before.member, REPORT_SURE) && !surely_not(self.member, DELAY_SURE);

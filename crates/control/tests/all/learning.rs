@@ -384,7 +384,7 @@ fn a_model_known_well_lets_more_be_learned_and_one_known_badly_less() {
 }
 
 #[test]
-fn where_the_slew_does_not_carry_the_motion_nothing_learned_stays_in_force() {
+fn where_the_slew_does_not_carry_the_motion_nothing_learned_stays_in_force_that_does_not_help() {
     // 1.5 um at 300 Hz asks for 12 um of PZT a tick, and the slew allows 10.
     for (amplitude_um, gain, adapt) in [
         (1.5, 0.8, true),
@@ -438,7 +438,9 @@ fn where_the_slew_does_not_carry_the_motion_nothing_learned_stays_in_force() {
             // Of those without adaptation only that within the slew can be mended.
             let carried = amplitude_um < 1.5 || gain > 1.0;
             if !carried {
-                assert!(table.harmonics.is_empty(), "{table:?}");
+                // The slew leaves a part that a table makes smaller if gain and delay are known.
+                let helps = adapt && with_um < without_um;
+                assert!(table.harmonics.is_empty() || helps, "{table:?}");
             } else if !adapt {
                 assert!(with_um < 0.4 * without_um, "{without_um} um, {with_um} um");
             }
