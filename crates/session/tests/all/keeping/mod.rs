@@ -7,6 +7,7 @@
 
 mod adverse;
 mod held;
+mod interval;
 mod law;
 mod rows;
 mod silence;

@@ -1,7 +1,7 @@
 //! The rows of the table, and what must hold in them.
 
 use super::held::{GAIN_PER_S, Held, OWN_KP, Row};
-use super::table::interval;
+use super::interval::interval;
 use cellpos_emulator::FaultKind;
 
 /// The laws: those of this project, and one of a user's own.
