@@ -1,7 +1,6 @@
 //! Which kind of recording a file is, and the command that converts those that are not read here.
 
-use super::SourceError;
-use std::io::{ErrorKind, Read};
+use std::io::{Error, ErrorKind, Read};
 use std::path::Path;
 
 /// Kinds of files.
@@ -102,7 +101,7 @@ const NAMES: [(&str, Format); 26] = [
 impl Format {
     /// The kind of a file: by its first bytes, but for raw pixels of a Photron camera, which may begin with any. `None` for a kind
     /// not known.
-    pub(super) fn of(path: &Path) -> Result<Option<Self>, SourceError> {
+    pub(super) fn of(path: &Path) -> Result<Option<Self>, Error> {
         let end = path.extension().and_then(|e| e.to_str());
         let end = end.unwrap_or_default().to_ascii_lowercase();
         let by_name = NAMES.iter().find(|(name, _)| *name == end).map(|n| n.1);
@@ -114,14 +113,7 @@ impl Format {
         if let Err(cause) = read {
             // The reader of a known kind says what is wrong in its own words.
             let is_known = by_name.is_some() && cause.kind() != ErrorKind::NotFound;
-            return if is_known {
-                Ok(by_name)
-            } else {
-                Err(SourceError::Unreadable {
-                    path: path.to_path_buf(),
-                    cause,
-                })
-            };
+            return if is_known { Ok(by_name) } else { Err(cause) };
         }
         let begins = |(at, bytes, _): &&(usize, &[u8], Format)| {
             first.get(*at..).is_some_and(|rest| rest.starts_with(bytes))

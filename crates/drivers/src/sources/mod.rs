@@ -241,7 +241,11 @@ pub fn open(path: &Path) -> Result<Box<dyn Recording>, SourceError> {
     if path.is_dir() {
         return Ok(Box::new(PictureFolder::open(path)?));
     }
-    match Format::of(path)? {
+    let format = Format::of(path).map_err(|cause| SourceError::Unreadable {
+        path: path.to_path_buf(),
+        cause,
+    })?;
+    match format {
         Some(Format::Tiff) => Ok(Box::new(TiffStack::open(path)?)),
         Some(Format::Photron) => Ok(Box::new(PhotronRecording::open(path)?)),
         #[cfg(feature = "hdf5")]
