@@ -9,6 +9,7 @@
 //! - [`frequency_response`], [`tone_fit`], [`spectral`]: gain and phase with standard deviations.
 //! - [`delay`]: the camera's delay from the edges of an LED.
 //! - [`rational`], [`from_response`], [`sampled`]: fits of a transfer function. [`base`]: a stated form, such as `order=2,delay`.
+//! - [`analogue`]: an input that is not held between its samples.
 //! - [`order_selection`]: how many poles the data support. [`identifiability`]: which parameters they determine.
 //! - [`summary`]: the result, ready for a model file.
 //!
@@ -25,6 +26,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod analogue;
 pub mod bare_fft;
 pub mod base;
 mod bootstrap;

@@ -3,14 +3,19 @@
 /// Price of a free number in twice the log-likelihood: what its value takes to be told from its range, to a few percent of it.
 pub(crate) const NUMBER: f64 = 8.0;
 
+/// Probability by which chance makes one false step in a whole search.
+pub(crate) const CHANCE: f64 = 0.05;
+
+/// What is beyond so many standard deviations is no chance: [`CHANCE`] over [`Thresholds::trials`], in the upper tail of a normal
+/// distribution. Cells of the map and numbers of a set are fewer, by as much as the shape of a floor (a walk and white noise) and of an
+/// equation is not that of nature to the last percent. Pinned by `records_that_hide_nothing_get_no_name`.
+pub(crate) const CHANCE_SD: f64 = 4.056;
+
 /// The numbers that decide. There is one set, [`THRESHOLDS`]; they are fields so that each has its reason beside it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Thresholds {
-    /// What an addition must gain in twice the log-likelihood: this quantile of chi-square with its degrees of freedom, in
-    /// standard deviations. 4.1 is 5 % together over some 2000 trials (variants, starts, pixel sizes).
-    /// Pinned by `records_that_hide_nothing_get_no_name`.
-    pub addition_sd: f64,
-    /// Factor on that for the error of the noise estimate. Pinned with it.
+    /// Factor, for the error of the noise estimate, on what an addition must gain in twice the log-likelihood: the quantile of chi-square
+    /// with its degrees of freedom at [`CHANCE_SD`]. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
     /// What a response to the command must gain beside others, in parts of what is explained already: the equations of the
     /// first effect are not those of nature to the last digit. Pinned by the tests' simulator (relays for play operators).
@@ -18,8 +23,6 @@ pub struct Thresholds {
     /// Rivals closer than this in twice the log-likelihood cannot be told from the winner: e^5 to 1.
     /// Pinned by `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
     pub tie: f64,
-    /// A valley no deeper than this below the best belongs to the 95 % interval (chi-square, one number).
-    pub valley: f64,
     /// A set that closes less than this part of the excess over the floor is no explanation.
     /// Pinned by `jumps_of_the_bead_are_unknown_and_it_says_where`.
     pub closed_least: f64,
@@ -34,16 +37,9 @@ pub struct Thresholds {
     /// can be detected at all among them, none closed less than 0.58; a few rows of jumps look like an
     /// effect that closes 0.02, an outflow that resists with the square of the speed like one that closes 0.47.
     pub held_out_least: f64,
-    /// After two effects, a set that leaves more than this part of the excess is on no way to an explanation: the search ends
-    /// there, and the verdict will be `unknown`. Saves minutes, decides nothing that [`Self::closed_least`] does not.
-    pub hopeless: f64,
-    /// The same after three.
-    pub hopeless_late: f64,
     /// Numbers that move by more than this part between parts of the records, beyond their intervals, belong to another
     /// equation. Pinned by `numbers_that_change_with_the_part_of_the_data_are_no_name`.
     pub split_share: f64,
-    /// What a split may gain by numbers of its own, in parts of what the set gains, before the numbers are looked at.
-    pub split_gain: f64,
     /// An effect smaller than the smallest that matters is not named unless it explains this part of the excess.
     pub small_share: f64,
     /// An effect beside larger ones that explains less than this part of the gap may be the difference between the catalogue's
@@ -64,7 +60,7 @@ pub struct Thresholds {
     /// A hysteresis of which a curve without memory in front of the plant explains this part is none: of relays it explains 0.4 to
     /// 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
     pub curve_share: f64,
-    /// Rows of rest or of repeated command from which noise is known to a few percent.
+    /// Rows of rest or of repeated command from which noise is known to a few percent, and rows in all from which effects can be told apart.
     pub floor_rows: usize,
     /// A command counts as at rest where its range is below this part of the range of all records: a measured input is
     /// never quite still. Pinned by `a_measured_input_rests_and_repeats_within_its_own_noise`.
@@ -75,37 +71,20 @@ pub struct Thresholds {
     pub repeat_share: f64,
     /// A stated noise is believed only where the records do not fall below it by more than this part.
     pub stated_excess: f64,
-    /// Trials of the search by which a probability is multiplied: variants, starts, pixel sizes. Pinned with `addition_sd`.
+    /// Trials of the search by which a probability is multiplied: variants, starts, pixel sizes. Pinned with `addition_noise`.
     pub trials: f64,
-    /// What the best of all pixel sizes must gain: beyond chance in some ten thousand trials of two degrees of freedom.
-    /// Pinned by `records_that_hide_nothing_get_no_name`.
-    pub pixel_gain: f64,
-    /// Least power of a line in the innovations, in units of the noise's own. Pinned by `leak_and_hum_together_are_both_named`
-    /// and, from the other side, by `records_that_hide_nothing_get_no_name`.
-    pub line_power: f64,
-    /// How far a line must stand above its neighbours, in power. Pinned with it.
+    /// How far a line must stand above its neighbours, in power. Pinned by `leak_and_hum_together_are_both_named` and, from the other
+    /// side, by `records_that_hide_nothing_get_no_name`.
     pub line_above: f64,
     /// Price, in twice the log-likelihood, of a main parameter outside the range that rigs show: decides ties between names.
     pub untypical: f64,
     /// The same, in parts of what a fit leaves over: one that is wrong elsewhere decides little by its last percent.
     pub untypical_share: f64,
-    /// What another effect in the place of one that was taken must gain for the two to be exchanged.
-    pub swap: f64,
-    /// By so much in twice the log-likelihood the stated localisation noise may decide between rivals that the records
-    /// cannot tell apart. Pinned by `averaging_over_the_exposure_is_told_from_a_delay_by_the_noise`.
-    pub white_decides: f64,
     /// A walk may differ from the model's by this part for the model's localisation noise to be believed of this rig: the
     /// radius of a bead and the viscosity of a warm room make so much. Pinned with it.
     pub walk_alike: f64,
     /// A fit that leaves more than this per row is rough: what rivals differ by in their last percent decides nothing.
     pub rough: f64,
-    /// Standard deviations beyond which a band, a third or a record of the discrepancy map is flagged. Records times bands and
-    /// thirds, 5 % together, would be 3.2 for 60 cells; a whole one more, because the floor's shape (a walk plus white noise)
-    /// is not that of nature to the last percent either. Pinned by `records_that_hide_nothing_get_no_name`.
-    pub flag_sd: f64,
-    /// The excess, in standard deviations of its scatter, beyond which records without an effect are not called
-    /// `nothing-missing`. Pinned with it.
-    pub null_sd: f64,
     /// A single row is a jump beyond so many standard deviations. Pinned by `jumps_of_the_bead_are_unknown_and_it_says_where`.
     pub jump_sd: f64,
     /// What a term must gain in twice the log-likelihood to be taken into a formula of what is left.
@@ -113,7 +92,7 @@ pub struct Thresholds {
     /// What it must gain to count as left over: some forty terms, each at chi-square with one number, are beyond chance at 25;
     /// the rest is for a noise whose shape is not quite a walk and white noise.
     pub term_least: f64,
-    /// And in parts of what the set gains.
+    /// And in parts of what the set gains, for no equation is nature's to the last digit: what a split may gain by numbers of its own, too.
     pub term_share: f64,
     /// With a remainder a set of a search that ended with its budget must close so much: else it may be a compromise between others.
     pub cut_closed: f64,
@@ -121,13 +100,9 @@ pub struct Thresholds {
     pub remainder_closed: f64,
     /// Most by which the scatter of a number between the records widens its interval: a single record may end in another valley.
     pub birge_most: f64,
-    /// And, with [`Self::split_share`], by more than so many standard deviations. Pinned with it.
-    pub split_sd: f64,
     /// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
-    /// Pinned by `wrong_units_constant_inputs_short_and_foreign_records_get_a_message`, as are the next two.
+    /// Pinned by `wrong_units_constant_inputs_short_and_foreign_records_get_a_message`, as is the next.
     pub needed_s: f64,
-    /// Fewest rows from which effects can be told apart.
-    pub needed_rows: usize,
     /// The same of records of other plants, which may be sampled slowly: fewer rows than a floor needs end without a name, and
     /// with what the rest looks like.
     pub needed_rows_of_others: usize,
@@ -151,20 +126,15 @@ pub struct Thresholds {
 
 /// The numbers in use.
 pub const THRESHOLDS: Thresholds = Thresholds {
-    addition_sd: 4.1,
     addition_noise: 1.3,
     addition_share: 0.0015,
     tie: 10.0,
-    valley: 3.84,
     closed_least: 0.80,
     closed_whole: 0.985,
     left_sd: 5.0,
     free_run_fall: 0.2,
     held_out_least: 0.5,
-    hopeless: 0.6,
-    hopeless_late: 0.3,
     split_share: 0.15,
-    split_gain: 0.01,
     small_share: 0.5,
     companion_share: 0.1,
     companion_times: 3.0,
@@ -177,17 +147,11 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     repeat_share: 0.14,
     stated_excess: 0.1,
     trials: 2000.0,
-    pixel_gain: 36.0,
-    line_power: 40.0,
     line_above: 10.0,
     untypical: 12.0,
     untypical_share: 0.2,
-    swap: 20.0,
-    white_decides: 16.0,
     walk_alike: 0.3,
     rough: 0.02,
-    flag_sd: 4.2,
-    null_sd: 4.0,
     jump_sd: 6.0,
     term_worth: 40.0,
     term_least: 80.0,
@@ -195,9 +159,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     cut_closed: 0.999,
     remainder_closed: 0.9,
     birge_most: 5.0,
-    split_sd: 4.0,
     needed_s: 5.0,
-    needed_rows: 400,
     needed_rows_of_others: 150,
     least_alike: 0.08,
     faults_least: 5,

@@ -10,11 +10,12 @@ use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_plant::Model;
 use cellpos_plant::effects::{self, Definition};
 use cellpos_reconcile::{Gap, NoiseKind, Options, Reconciliation, Units, Verdict, figure_of};
+use cellpos_record::RunReader;
 use cellpos_workbench::experiment::collect::{self, Collected, Collecting};
 use cellpos_workbench::experiment::on_rig::OnRig;
 use cellpos_workbench::foreign::{columns, form};
 use model::{Asked, Data};
-use records::{Columns, files, is_run, read, read_run};
+use records::{Columns, Noises, files, is_run, read, read_run};
 use std::path::{Path, PathBuf};
 
 /// Heading of the options that need a rig.
@@ -146,9 +147,12 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let files = files(&args.data)?;
     let mut records = Vec::new();
     let mut rests_um = Vec::new();
+    let mut noises = Noises::default();
     for file in &files {
         if is_run(file) {
-            let (record, rest_um) = read_run(file)?;
+            let run = RunReader::open(file).map_err(Failure::input)?;
+            noises.add(file, &run)?;
+            let (record, rest_um) = read_run(file, &run)?;
             records.push(record);
             rests_um.extend(rest_um);
         } else {

@@ -1,5 +1,6 @@
 //! The responses that a fit combines: each power of s over the denominator, driven by a record's input, and the response to each start.
 
+use crate::analogue::{between, means};
 use crate::sampled::Hold;
 use nalgebra::DMatrix;
 
@@ -18,8 +19,8 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// The grid of an input, one value a row. A held input is its own grid. A smooth input is interpolated between samples: by cubics
-    /// whose slope at a sample comes from its neighbours, or by straight lines if the plant has a direct path.
+    /// The grid of an input, one value a row. A held input is its own grid. In the steps of an analogue one stands its mean, or, if the
+    /// plant has a direct path, its value at the end.
     pub fn new(input: &[f64], hold: Hold, direct: bool) -> Self {
         if hold == Hold::ZeroOrder {
             return Self {
@@ -28,30 +29,11 @@ impl Grid {
                 steps: 1,
             };
         }
-        let mut end = Vec::with_capacity(input.len() * FINE);
-        for (k, &here) in input.iter().enumerate() {
-            let at = |i: usize| input.get(i).copied();
-            let next = at(k + 1).unwrap_or(here);
-            let (before, after) = (input[k.saturating_sub(1)], at(k + 2).unwrap_or(next));
-            let bend = |f: f64| {
-                let d = next - here;
-                let (a, b) = (0.5 * (next - before) - d, 0.5 * (after - here) - d);
-                f * (1.0 - f) * ((1.0 - f) * a - f * b)
-            };
-            for i in 1..=FINE {
-                let f = i as f64 / FINE as f64;
-                let line = here + f * (next - here);
-                end.push(if direct { line } else { line + bend(f) });
-            }
+        let end = between(input, FINE);
+        let mut held = end.clone();
+        if !direct {
+            means(&mut held);
         }
-        let mut before = input.first().copied().unwrap_or(0.0);
-        let held = if direct {
-            end.clone()
-        } else {
-            end.iter()
-                .map(|&v| 0.5 * (std::mem::replace(&mut before, v) + v))
-                .collect()
-        };
         Self {
             held,
             end,
@@ -94,7 +76,10 @@ pub(super) fn driven(denominator: &[f64], delay: f64, grid: &Grid) -> Vec<Vec<f6
             for (column, z) in out.iter_mut().zip(&z) {
                 column.push(*z);
             }
-            out[n].push(late_by(&grid.end, j, whole + 1));
+            out[n].push(match grid.steps {
+                1 => late_by(&grid.end, j, whole + 1),
+                _ => smooth(&grid.end, (j as f64 - 1.0 - late).max(0.0)),
+            });
         }
         let (v1, v2) = (
             late_by(&grid.held, j, whole + 1),
@@ -114,6 +99,17 @@ pub(super) fn driven(denominator: &[f64], delay: f64, grid: &Grid) -> Vec<Vec<f6
         std::mem::swap(&mut z, &mut next);
     }
     out
+}
+
+/// A smooth signal at a place on its grid: the cubic through the values on both sides whose slopes there are those of their neighbours.
+fn smooth(values: &[f64], at: f64) -> f64 {
+    let last = values.len().saturating_sub(1);
+    let (i, f) = (at as usize, at.fract());
+    let v = |k: usize| values.get(k.min(last)).copied().unwrap_or(0.0);
+    let (a, b, c, d) = (v(i.saturating_sub(1)), v(i), v(i + 1), v(i + 2));
+    let (up, down) = (0.5 * (c - a), 0.5 * (d - b));
+    let bend = f * (1.0 - f) * ((1.0 - f) * (up - c + b) - f * (down - c + b));
+    b + f * (c - b) + bend
 }
 
 /// Responses at the rows if one state starts at 1, for each state.

@@ -1,6 +1,7 @@
 //! The noise floor, from the records or from what is stated, before any model is believed; or the statement that it is not
 //! known.
 
+use crate::data::cleaned::{without_jumps, without_lines};
 use crate::data::coloured::{Alone, NoiseKind, choose};
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
@@ -8,7 +9,7 @@ use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
 use crate::data::zero_flow::descend;
 use crate::thresholds::THRESHOLDS;
 use serde::Serialize;
-use std::f64::consts::TAU;
+use std::ops::Range;
 
 /// Where the noise floor comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -63,6 +64,8 @@ struct Estimate {
     c0: f64,
     c1: f64,
     rows: usize,
+    /// How many of these are independent, in parts of them.
+    independent: f64,
     source: FloorSource,
     /// The noise itself, lines and jumps off, and which rows count.
     alone: (Vec<f64>, Vec<bool>),
@@ -78,13 +81,23 @@ impl Estimate {
         }
     }
 
+    /// Whether it has rows enough.
+    fn counts(&self) -> bool {
+        self.rows >= THRESHOLDS.floor_rows && self.c0 > 0.0
+    }
+
+    /// Independent increments.
+    fn independent(&self) -> usize {
+        (self.independent * self.rows as f64) as usize
+    }
+
     fn sigma(&self) -> f64 {
         NoiseModel::from_increments(self.c0, self.c1).innovation_um()
     }
 
     /// The most that the standard deviation is, by so many increments.
     fn most(&self) -> f64 {
-        self.sigma() * (1.0 + error_of(self.rows))
+        self.sigma() * (1.0 + error_of(self.independent()))
     }
 }
 
@@ -112,57 +125,29 @@ pub(crate) fn estimate(
     stated: Option<NoiseModel>,
     kind: NoiseKind,
 ) -> Floor {
-    let whole = crate::data::record::command_range_um(records);
-    let mut found: Vec<Estimate> = Vec::new();
-    let mut own: Vec<Estimate> = Vec::new();
-    for (i, r) in records.iter().enumerate() {
-        let (e, present_i) = (&residuals[i], &present[i]);
-        if r.rests_within(THRESHOLDS.rest_share * whole) {
-            found.push(of(e, present_i, r.sample_s, FloorSource::Rest, 1.0));
-        } else if let Some(repeats) = whole_periods(r) {
-            for (d, ok) in between_periods(r, e, present_i, &repeats) {
-                found.push(of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5));
+    let mut found = of_records(records, present, residuals);
+    let own: Vec<Estimate> = (residuals.iter().zip(present))
+        .map(|(e, present)| {
+            let (c0, c1, rows) = increment_moments(e, present);
+            Estimate {
+                c0,
+                c1,
+                rows,
+                independent: 1.0,
+                source: FloorSource::Unknown,
+                alone: (e.clone(), present.clone()),
+                share: 1.0,
             }
-        }
-        for j in 0..i {
-            if r.same_command(&records[j]) {
-                let n = e.len().min(residuals[j].len());
-                let ok: Vec<bool> = (0..n).map(|k| present_i[k] && present[j][k]).collect();
-                let d: Vec<f64> = (0..n).map(|k| e[k] - residuals[j][k]).collect();
-                found.push(of(&d, &ok, r.sample_s, FloorSource::EqualRecords, 0.5));
-            }
-        }
-        let (c0, c1, rows) = increment_moments(e, present_i);
-        own.push(Estimate {
-            c0,
-            c1,
-            rows,
-            source: FloorSource::Unknown,
-            alone: (e.clone(), present_i.clone()),
-            share: 1.0,
-        });
-    }
+        })
+        .collect();
     let quantum_um2 = quantisation_um2(records);
     // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
     let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
     let kind = if unasked { NoiseKind::Walk } else { kind };
-    let counts = |f: &Estimate| f.rows >= THRESHOLDS.floor_rows && f.c0 > 0.0;
     // Where no record as a whole tells the noise, parts of them may: a misfit can only add.
-    if !found.iter().any(counts) {
-        for (i, r) in records.iter().enumerate() {
-            let (e, ok) = (&residuals[i], &present[i]);
-            if let Some(repeats) = repeats(r) {
-                for (d, ok) in between_periods(r, e, ok, &repeats) {
-                    found.push(of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5));
-                }
-            }
-            for rows in rests(r) {
-                let (e, ok) = (&e[rows.clone()], &ok[rows]);
-                found.push(of(e, ok, r.sample_s, FloorSource::Rest, 1.0));
-            }
-        }
+    if found.is_empty() {
+        found = of_parts(records, present, residuals);
     }
-    found.retain(counts);
     if let Some(least) = found.iter().min_by(|a, b| a.most().total_cmp(&b.most())) {
         let pooled = pooled(&found, least);
         let walk = NoiseModel::from_increments(pooled.c0, pooled.c1);
@@ -173,7 +158,9 @@ pub(crate) fn estimate(
             rows: pooled.rows,
         };
     }
-    own.retain(|f| f.rows >= 20 && f.c0 > 0.0);
+    let own: Vec<Estimate> = (own.into_iter())
+        .filter(|f| f.rows >= 20 && f.c0 > 0.0)
+        .collect();
     let residual = own
         .iter()
         .min_by(|a, b| a.most().total_cmp(&b.most()))
@@ -189,7 +176,10 @@ pub(crate) fn estimate(
             if noise.innovation_um() < (1.0 + THRESHOLDS.stated_excess) * least.innovation_um() =>
         {
             Floor {
-                noise: noise.at_least(quantum_um2),
+                noise: NoiseModel {
+                    white_um2: noise.white_um2.max(quantum_um2),
+                    ..noise
+                },
                 source: FloorSource::Stated,
                 rows: 0,
             }
@@ -202,28 +192,98 @@ pub(crate) fn estimate(
     }
 }
 
+/// Independent squares in the sum of those of so many successive differences, in parts of their number. Neighbours share a noise: their
+/// correlation is -1/2, that of their squares 1/4, and the sum of `m` of them scatters as that of `m^2/(m + (m - 1)/2)` independent ones.
+fn independent(differences: f64) -> f64 {
+    let m = differences.max(1.0);
+    m / (m + 0.5 * (m - 1.0))
+}
+
+/// What whole records tell of the noise. Each row tells once: by the rest or the periods of its own record, else by the record before it
+/// with the same command.
+fn of_records(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
+    let whole = crate::data::record::command_range_um(records);
+    let mut found: Vec<Estimate> = Vec::new();
+    let mut silent: Vec<usize> = Vec::new();
+    for (i, r) in records.iter().enumerate() {
+        let (e, ok) = (&residuals[i], &present[i]);
+        let own = if r.rests_within(THRESHOLDS.rest_share * whole) {
+            Some(of(e, ok, r.sample_s, FloorSource::Rest, 1.0))
+        } else {
+            whole_periods(r).and_then(|repeats| between_periods(r, e, ok, &repeats))
+        };
+        match own.filter(Estimate::counts) {
+            Some(own) => found.push(own),
+            None => silent.push(i),
+        }
+    }
+    for (at, &i) in silent.iter().enumerate() {
+        let equal = |j: &&usize| records[i].same_command(&records[**j]);
+        let Some(&j) = silent[..at].iter().rev().find(equal) else {
+            continue;
+        };
+        let differences = silent.iter().filter(equal).count() - 1;
+        let (a, b) = (&residuals[i], &residuals[j]);
+        let d: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
+        let ok: Vec<bool> = (present[i].iter().zip(&present[j]))
+            .map(|(a, b)| *a && *b)
+            .collect();
+        let ok = &ok[..d.len()];
+        let mut equals = of(&d, ok, records[i].sample_s, FloorSource::EqualRecords, 0.5);
+        equals.independent = independent(differences as f64);
+        found.push(equals);
+    }
+    found.retain(Estimate::counts);
+    found
+}
+
+/// What parts of records tell of the noise: stretches in which the command repeats itself, and its rests elsewhere.
+fn of_parts(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
+    let mut found: Vec<Estimate> = Vec::new();
+    for (i, r) in records.iter().enumerate() {
+        let (e, ok) = (&residuals[i], &present[i]);
+        let repeated = repeats(r).and_then(|repeats| {
+            let own = between_periods(r, e, ok, &repeats).filter(Estimate::counts)?;
+            Some((repeats, own))
+        });
+        let told = |rows: &Range<usize>| {
+            repeated.iter().any(|(repeats, _)| {
+                (repeats.ranges.iter())
+                    .any(|o| rows.start < o.end && rows.end > o.start - repeats.rows)
+            })
+        };
+        for rows in rests(r).into_iter().filter(|rows| !told(rows)) {
+            let (e, ok) = (&e[rows.clone()], &ok[rows]);
+            found.push(of(e, ok, r.sample_s, FloorSource::Rest, 1.0));
+        }
+        found.extend(repeated.map(|(_, own)| own));
+    }
+    found.retain(Estimate::counts);
+    found
+}
+
 /// An estimate from residuals or differences that hold nothing but noise, `share` of it that of one record.
 fn of(e: &[f64], ok: &[bool], sample_s: f64, source: FloorSource, share: f64) -> Estimate {
-    let clean = without_lines(e, ok, sample_s);
+    let (clean, fitted) = without_lines(e, ok, sample_s);
     let counts = without_jumps(&clean, ok);
     let (c0, c1, rows) = increment_moments(&clean, &counts);
+    // Numbers that were fitted, the mean among them, took their share of the squares.
+    let fitted = (1 + fitted).min(rows / 2) as f64;
+    let share = share * rows as f64 / (rows as f64 - fitted).max(1.0);
     Estimate {
         c0: share * c0,
         c1: share * c1,
         rows,
+        independent: 1.0,
         source,
         alone: (clean, counts),
         share,
     }
 }
 
-/// Differences of residuals and of positions between a row and the row a period before, and which of them count.
-fn between_periods(
-    r: &Record,
-    e: &[f64],
-    present: &[bool],
-    repeats: &Repeats,
-) -> [(Vec<f64>, Vec<bool>); 2] {
+/// What the differences between rows and the rows a period before tell: of residuals or of positions, whichever is the smaller. The
+/// noise of a measured input goes through the model into the residuals, and not into the positions; they are the same rows.
+fn between_periods(r: &Record, e: &[f64], present: &[bool], repeats: &Repeats) -> Option<Estimate> {
     let p = repeats.rows;
     let first = repeats.ranges.first().map_or(p, |range| range.start);
     let last = repeats.ranges.last().map_or(p, |range| range.end);
@@ -235,30 +295,45 @@ fn between_periods(
             inside && present[k] && present[k - p]
         })
         .collect();
-    // The noise of a measured input goes through the model into the residuals, and not into the positions.
-    let y = &r.bead_um;
-    let of_residuals = rows.clone().map(|k| e[k] - e[k - p]).collect();
-    let of_positions = rows
-        .map(|k| y[k] - y[k - p])
-        .map(|d| if d.is_finite() { d } else { 0.0 })
-        .collect();
-    [(of_residuals, ok.clone()), (of_positions, ok)]
+    let periods = ok.iter().filter(|ok| **ok).count() as f64 / p as f64;
+    let told = |values: &[f64]| {
+        let d: Vec<f64> = (rows.clone())
+            .map(|k| values[k] - values[k - p])
+            .map(|d| if d.is_finite() { d } else { 0.0 })
+            .collect();
+        let mut own = of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5);
+        own.independent = independent(periods);
+        own
+    };
+    [told(e), told(&r.bead_um)]
+        .into_iter()
+        .filter(|f| f.c0 > 0.0)
+        .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
 }
 
 /// Those that differ from the least by chance together.
 fn pooled(of: &[Estimate], least: &Estimate) -> Estimate {
     let by_chance = |f: &&Estimate| {
-        let error = error_of(f.rows).hypot(error_of(least.rows));
+        let error = error_of(f.independent()).hypot(error_of(least.independent()));
         (f.sigma() / least.sigma() - 1.0).abs() <= error
     };
     let near: Vec<&Estimate> = of.iter().filter(by_chance).collect();
-    let n: f64 = near.iter().map(|f| f.rows as f64).sum::<f64>().max(1.0);
-    let mean =
-        |get: fn(&Estimate) -> f64| near.iter().map(|f| get(f) * f.rows as f64).sum::<f64>() / n;
+    let n: f64 = near
+        .iter()
+        .map(|f| f.independent() as f64)
+        .sum::<f64>()
+        .max(1.0);
+    let mean = |get: fn(&Estimate) -> f64| {
+        near.iter()
+            .map(|f| get(f) * f.independent() as f64)
+            .sum::<f64>()
+            / n
+    };
     Estimate {
         c0: mean(|f| f.c0),
         c1: mean(|f| f.c1),
         rows: n as usize,
+        independent: 1.0,
         source: FloorSource::Unknown,
         alone: Default::default(),
         share: 1.0,
@@ -326,61 +401,6 @@ pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize
     )
 }
 
-/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):
-/// a bead that jumps is no noise, and must not raise the floor under which its jumps would then hide.
-fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
-    let mut sizes: Vec<f64> = (1..e.len())
-        .filter(|&k| present[k] && present[k - 1])
-        .map(|k| (e[k] - e[k - 1]).abs())
-        .collect();
-    if sizes.is_empty() {
-        return present.to_vec();
-    }
-    let middle = sizes.len() / 2;
-    let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
-    let limit = 6.0 * 1.4826 * *median;
-    (0..e.len())
-        .map(|k| {
-            let jumps = k > 0 && limit > 0.0 && (e[k] - e[k - 1]).abs() > limit;
-            present[k] && !jumps
-        })
-        .collect()
-}
-
-/// Takes lines at 50 and 60 Hz and their second harmonics off.
-fn without_lines(e: &[f64], present: &[bool], sample_s: f64) -> Vec<f64> {
-    let mut clean = e.to_vec();
-    for hz in [50.0, 60.0, 100.0, 120.0] {
-        if hz * sample_s > 0.45 {
-            continue;
-        }
-        // On increments, where the walk does not leak into the line.
-        let (mut ss, mut cc, mut sc, mut se, mut ce) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        for k in 1..clean.len() {
-            if present[k] && present[k - 1] {
-                let w = TAU * hz * sample_s;
-                let (s1, c1) = (w * k as f64).sin_cos();
-                let (s0, c0) = (w * (k - 1) as f64).sin_cos();
-                let (s, c, d) = (s1 - s0, c1 - c0, clean[k] - clean[k - 1]);
-                ss += s * s;
-                cc += c * c;
-                sc += s * c;
-                se += s * d;
-                ce += c * d;
-            }
-        }
-        let det = ss * cc - sc * sc;
-        if det > 1e-12 {
-            let (a, b) = ((cc * se - sc * ce) / det, (ss * ce - sc * se) / det);
-            for (k, v) in clean.iter_mut().enumerate() {
-                let (s, c) = (TAU * hz * sample_s * k as f64).sin_cos();
-                *v -= a * s + b * c;
-            }
-        }
-    }
-    clean
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -390,6 +410,7 @@ mod tests {
             c0: sigma * sigma,
             c1: 0.0,
             rows,
+            independent: 1.0,
             source: FloorSource::Rest,
             alone: Default::default(),
             share: 1.0,
@@ -410,5 +431,54 @@ mod tests {
             &measured(1.0, 481),
         );
         assert!((floor.sigma() - 1.0).abs() < 1e-9);
+    }
+
+    /// Records of a walk behind a command of 450 rows, so many times, and the estimates of their noise over many seeds: the scatter of the
+    /// variance in parts of what as many independent increments have as are stated.
+    fn scatter(commands: &[Vec<f64>]) -> f64 {
+        const SEEDS: u64 = 300;
+        let mut squares = 0.0;
+        for seed in 0..SEEDS {
+            let mut random = cellpos_numeric::Random::new(seed);
+            let (mut records, mut residuals, mut present) = (Vec::new(), Vec::new(), Vec::new());
+            for (i, u) in commands.iter().enumerate() {
+                let t: Vec<f64> = (0..u.len()).map(|k| 1e-3 * k as f64).collect();
+                let mut walk = 0.0;
+                let steps = std::iter::repeat_with(|| {
+                    walk += random.normal();
+                    walk
+                });
+                let walk: Vec<f64> = steps.take(u.len()).collect();
+                let y: Vec<f64> = u.iter().zip(&walk).map(|(u, w)| u + w).collect();
+                records.push(Record::from_rows(&format!("r{i}"), &t, u, &y).unwrap());
+                present.push(vec![true; u.len()]);
+                residuals.push(walk);
+            }
+            let floor = estimate(&records, &present, &residuals, None, NoiseKind::Walk);
+            let error = floor.noise.innovation_um().powi(2) - 1.0;
+            squares += error * error * floor.rows as f64 / 2.0;
+        }
+        squares / SEEDS as f64
+    }
+
+    #[test]
+    fn every_row_is_counted_once() {
+        let mut random = cellpos_numeric::Random::new(3);
+        let levels: Vec<f64> = (0..45).map(|_| 10.0 * random.uniform()).collect();
+        let once: Vec<f64> = (0..450).map(|k| levels[k / 10]).collect();
+        let periods = |n: usize| once.repeat(n);
+        let rest = vec![5.0; 450];
+        let ways = [
+            vec![periods(2)],
+            vec![periods(5)],
+            vec![once.clone(), once.clone(), once.clone(), once.clone()],
+            vec![once.clone(), rest.clone(), rest.clone(), rest],
+            vec![periods(3), periods(3)],
+        ];
+        for (i, way) in ways.iter().enumerate() {
+            let scatter = scatter(way);
+            // 300 squares scatter by 8 %.
+            assert!((0.75..1.3).contains(&scatter), "{i}: {scatter}");
+        }
     }
 }

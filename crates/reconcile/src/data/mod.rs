@@ -1,6 +1,7 @@
 //! Records as they come: rows, missing and repeated frames, the noise that they show.
 
 pub(crate) mod actuator;
+mod cleaned;
 pub(crate) mod coloured;
 pub(crate) mod floor;
 pub(crate) mod flow_estimate;

@@ -68,10 +68,12 @@ impl NoiseModel {
         }
     }
 
-    /// The same with at least so much white noise \[um^2\].
+    /// The same with at least so much white noise \[um^2\]; increments have the variance that they had.
     pub fn at_least(self, white_um2: f64) -> Self {
+        let more = (white_um2 - self.white_um2).max(0.0);
         Self {
-            white_um2: self.white_um2.max(white_um2),
+            walk_um2: (self.walk_um2 - 2.0 * more).max(0.0),
+            white_um2: self.white_um2 + more,
             ..self
         }
     }

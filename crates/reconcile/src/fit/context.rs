@@ -150,14 +150,17 @@ impl Context<'_> {
     }
 
     /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
-    /// is no error; a sensor that counts in steps has no pixels.
+    /// is no error; a sensor that counts in steps has no pixels; a constant flow is a number of every fit where the working point is free.
     pub(crate) fn excludes(&self, id: &str) -> bool {
         let Some(kind) = find(id) else {
             return false;
         };
         let of_pixels = kind.candidates().iter().any(|c| c.role == Role::Position);
         let of_bead = matches!(kind.spec().place, Place::Chip | Place::Bead);
-        self.quantised && of_pixels || self.free_gain && of_bead
+        let of_flow = (kind.candidates().iter()).any(|c| c.role == Role::Chain && c.off_response);
+        self.quantised && of_pixels
+            || self.free_gain && of_bead
+            || self.problem.base.free_working_point && of_flow
     }
 
     /// The longest delay that is a number of these records \[s\]: a tenth of a second on this rig; of another plant as many rows as

@@ -101,12 +101,17 @@ impl Context<'_> {
 
     /// Carries a fit on.
     pub(crate) fn refit(&self, fit: &Fit, mask: &Mask, iterations: usize) -> Fit {
-        self.run(fit.clone(), mask, Until::done(iterations))
+        self.run(fit.clone(), mask, Until::done(iterations), None)
+    }
+
+    /// Carries a fit on with one of its numbers held where it is.
+    pub(crate) fn refit_with(&self, fit: &Fit, mask: &Mask, iterations: usize, held: usize) -> Fit {
+        self.run(fit.clone(), mask, Until::done(iterations), Some(held))
     }
 
     /// Carries a fit on, as long as it may still come down to a sum of squares.
     pub(crate) fn refit_towards(&self, fit: &Fit, mask: &Mask, until: Until) -> Fit {
-        self.run(fit.clone(), mask, until)
+        self.run(fit.clone(), mask, until, None)
     }
 
     /// As [`Self::fit`], with the nuisances of an earlier fit as starting values where they apply.
@@ -153,10 +158,11 @@ impl Context<'_> {
             covariance: DMatrix::zeros(0, 0),
             log_information: 0.0,
         };
-        self.run(fit, mask, until)
+        self.run(fit, mask, until, None)
     }
 
-    fn run(&self, mut fit: Fit, mask: &Mask, until: Until) -> Fit {
+    /// Descends; the number `still`, if any, stays where it is.
+    fn run(&self, mut fit: Fit, mask: &Mask, until: Until, still: Option<usize>) -> Fit {
         fit.count = self.problem.count(mask);
         let mut state = self.state(&fit, mask);
         let mut lambda = 1e-3;
@@ -167,7 +173,7 @@ impl Context<'_> {
         loop {
             let (n, columns) = self.columns(&fit, &state, mask);
             size = n;
-            let (a, g) = normal_equations(n, &columns, &state.innovations, mask);
+            let (a, mut g) = normal_equations(n, &columns, &state.innovations, mask);
             normal = a;
             // Operators wider than any swing of the records never move: their weights stay where they are.
             let mut held = normal.clone();
@@ -179,6 +185,11 @@ impl Context<'_> {
                     }
                 }
                 at += freedom_of(p.variant(), self.problem.records.len());
+            }
+            if let Some(still) = still {
+                held.row_mut(still).fill(0.0);
+                held.column_mut(still).fill(0.0);
+                g[still] = 0.0;
             }
             if round >= until.iterations {
                 break;

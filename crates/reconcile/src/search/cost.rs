@@ -3,7 +3,7 @@
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::problem::Mask;
-use crate::thresholds::{NUMBER, THRESHOLDS};
+use crate::thresholds::{CHANCE, CHANCE_SD, NUMBER, THRESHOLDS};
 use cellpos_plant::effects::{Action, Candidate, Role};
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
@@ -12,13 +12,18 @@ fn chi2_quantile(k: f64, z: f64) -> f64 {
     k * (1.0 - a + z * a.sqrt()).powi(3)
 }
 
-/// What an addition must gain to count: family-wise 5 % over all variants, their starts and the scan of pixel sizes
-/// (about 2000 trials, 4.1 standard deviations), times 1.3 for the error of the noise estimate.
+/// What an addition must gain to count: beyond chance over all variants, their starts and the scan of pixel sizes, and beyond the error of
+/// the noise estimate.
 pub(crate) fn threshold(freedom: usize) -> f64 {
-    THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, THRESHOLDS.addition_sd)
+    THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, CHANCE_SD)
 }
 
-/// The same for a variant in a problem of so many records.
+/// What the best of so many waves, each with its sine and cosine, must gain: the tail of chi-square with two degrees is `exp(-x/2)`.
+pub(crate) fn threshold_of_waves(tried: usize) -> f64 {
+    THRESHOLDS.addition_noise * 2.0 * (tried as f64 / CHANCE).ln()
+}
+
+/// As [`threshold`], for a variant in a problem of so many records.
 pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }

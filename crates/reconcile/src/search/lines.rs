@@ -3,6 +3,7 @@
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
+use crate::search::cost::threshold_of_waves;
 use crate::search::suspect::line_score;
 use crate::thresholds::THRESHOLDS;
 use std::f64::consts::TAU;
@@ -61,9 +62,10 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
     let n = e.len().min(4000);
     let dt = ctx.problem.base.sample_s;
     let mut found: Vec<(f64, f64)> = Vec::new();
+    let least = threshold_of_waves(coarse.len() * PARTS as usize);
     for f in coarse {
-        for part in 0..8 {
-            let hz = f + f64::from(part) / 8.0;
+        for part in 0..PARTS {
+            let hz = f + f64::from(part) / f64::from(PARTS);
             let (mut s, mut c) = (0.0, 0.0);
             for (k, e) in e[..n].iter().enumerate() {
                 let (a, b) = (TAU * hz * k as f64 * dt).sin_cos();
@@ -71,7 +73,7 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
                 c += b * e;
             }
             let p = 2.0 * (s * s + c * c) / n as f64;
-            if p > THRESHOLDS.line_power {
+            if p > least {
                 found.push((hz, p));
             }
         }
@@ -89,6 +91,8 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
         .map(|b| b.0)
 }
 
+/// Frequencies per hertz.
+const PARTS: u32 = 8;
 /// Frequencies that are looked at, strongest first.
 const MOST_TRIED: usize = 100;
 /// A response that bends answers at multiples of the command's lines: up to this one.

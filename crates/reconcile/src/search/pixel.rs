@@ -6,8 +6,8 @@
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::problem::{Mask, Prepared};
+use crate::search::cost::threshold_of_waves;
 use crate::search::suspect::{Suspect, pair_score};
-use crate::thresholds::THRESHOLDS;
 use realfft::RealFftPlanner;
 use std::f64::consts::TAU;
 
@@ -86,7 +86,8 @@ pub(crate) fn pixel_scan(
         })
         .collect();
     let (best, top, middle) = peak(&scores, from)?;
-    if top < 0.7 * THRESHOLDS.pixel_gain * middle {
+    let least = threshold_of_waves(scores.len());
+    if top < 0.7 * least * middle {
         return None;
     }
     let centre = (best + from) as f64 * step;
@@ -98,7 +99,7 @@ pub(crate) fn pixel_scan(
         pair_score(&s, &c, &e)
     });
     let (best, &score) = gains.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
-    if score < THRESHOLDS.pixel_gain * middle {
+    if score < least * middle {
         return None;
     }
     Some(Suspect {

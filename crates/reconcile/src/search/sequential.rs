@@ -307,7 +307,7 @@ fn reparametrise(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort, r
         if let Some(best) = fits
             .into_iter()
             .min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
-            && penalised_cost(ctx, &best) < penalised_cost(ctx, &fit) - THRESHOLDS.swap
+            && penalised_cost(ctx, &best) < penalised_cost(ctx, &fit) - THRESHOLDS.tie
         {
             fit = best;
         }
@@ -320,14 +320,12 @@ fn much_left(fit: &Fit) -> bool {
     left_over(fit) > 0.01 * fit.count as f64
 }
 
-/// Whether a set is on no way to an explanation.
-fn is_hopeless(fit: &Fit, null: &Fit) -> bool {
-    let most = match fit.parts.len() {
-        0 | 1 => return false,
-        2 => THRESHOLDS.hopeless,
-        _ => THRESHOLDS.hopeless_late,
-    };
-    left_over(fit) > most * left_over(null)
+/// Whether a set of two or more is on no way to an explanation: with as many effects as may be, each worth what those of the set are on the
+/// average, it would be none. A search takes what is worth most first.
+fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
+    let (whole, left, count) = (left_over(null), left_over(fit), fit.parts.len());
+    let open = left - (whole - left) / count.max(1) as f64 * most.saturating_sub(count) as f64;
+    count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
 
 /// The best single effect and its two rivals; `None` where nothing is worth a name.
@@ -383,7 +381,7 @@ pub(crate) fn search(
             cut_short = true;
             break;
         }
-        if is_hopeless(&fit, &null) {
+        if is_hopeless(&fit, &null, effort.max_effects) {
             break;
         }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));

@@ -37,36 +37,3 @@ pub(super) fn slew(x: &mut [f64], rate: f64, h: f64) {
         at += d;
     }
 }
-
-/// The mean over each step of a line through the values at the steps' ends: what a plant without a direct path answers to.
-pub(super) fn middle(x: &mut [f64]) {
-    let mut before = x.first().copied().unwrap_or(0.0);
-    for v in x.iter_mut() {
-        (before, *v) = (*v, 0.5 * (before + *v));
-    }
-}
-
-/// Between the samples, straight lines, or (`smooth`) cubics whose slope at a sample is that of its neighbours, which take far
-/// less from the fast part of an analogue input; each step of the grid holds the value at its end, so that a plant without dynamics
-/// is exact at the samples.
-pub(super) fn interpolate(u: &[f64], fine: usize, smooth: bool) -> Vec<f64> {
-    let mut x = Vec::with_capacity(u.len() * fine);
-    for k in 0..u.len() {
-        let next = u.get(k + 1).copied().unwrap_or(u[k]);
-        for i in 0..fine {
-            let f = (i as f64 + 1.0) / fine as f64;
-            let line = u[k] + f * (next - u[k]);
-            x.push(if smooth {
-                let before = u[k.saturating_sub(1)];
-                let after = u.get(k + 2).copied().unwrap_or(next);
-                // The cubic through both samples with half the neighbours' difference as slope, less the line.
-                let (a, b) = (0.5 * (next - before), 0.5 * (after - u[k]));
-                let d = next - u[k];
-                line + f * (1.0 - f) * ((1.0 - f) * (a - d) - f * (b - d))
-            } else {
-                line
-            });
-        }
-    }
-    x
-}

@@ -11,11 +11,12 @@ mod modal;
 
 use camera::Frames;
 pub(crate) use camera::{Sampling, near_whole};
+use cellpos_ident::analogue::{between, means};
 use cellpos_plant::TiedPlant;
 use cellpos_plant::effects::{Action, Around, Block, Piece, Shown};
 pub(crate) use cellpos_plant::{Effect, Place, Zpk};
 pub(crate) use input::Input;
-use input::{interpolate, middle, slew};
+use input::slew;
 use modal::{Modal, Trace, has_fast_pole};
 
 /// The plant and the sampling that all records of a problem share.
@@ -257,7 +258,7 @@ impl<'a> Chain<'a> {
         let h = self.base.sample_s / self.fine as f64;
         let (mut x, pending) = self.ahead_of_plant(u, h);
         if self.base.interpolated_input && self.base.zpk.zeros.len() < self.base.zpk.poles.len() {
-            middle(&mut x);
+            means(&mut x);
         }
         let modal = Modal::new(&pending.clone().series(&self.plant), h);
         if let Some(edge) = edge {
@@ -285,7 +286,7 @@ impl<'a> Chain<'a> {
         let mut t = Trace::default();
         modal.trace(&x, self.fine, &mut t);
         if self.base.interpolated_input {
-            t.straighten(h);
+            t.smooth(h);
         }
         let carried = self.carried(h);
         t.add(&carried, 1.0);
@@ -345,8 +346,7 @@ impl<'a> Chain<'a> {
     /// What enters the plant, step by step, without the linear blocks that come last before it.
     fn ahead_of_plant(&mut self, u: &[f64], h: f64) -> (Vec<f64>, Zpk) {
         let mut x: Vec<f64> = if self.base.interpolated_input {
-            let smooth = self.base.zpk.zeros.len() < self.base.zpk.poles.len();
-            interpolate(u, self.fine, smooth)
+            between(u, self.fine)
         } else if self.fine == 1 {
             u.to_vec()
         } else {
@@ -433,7 +433,7 @@ impl<'a> Chain<'a> {
             let mut beside = Trace::default();
             Modal::new(&pending.clone().series(zpk), h).trace(x, self.fine, &mut beside);
             if self.base.interpolated_input {
-                beside.straighten(h);
+                beside.smooth(h);
             }
             t.add(&beside, 1.0);
         }

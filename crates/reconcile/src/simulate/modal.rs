@@ -140,18 +140,21 @@ impl Trace {
         add(&mut self.end_slope, &other.end_slope);
     }
 
-    /// Takes the jumps of a grid of steps for the straight line that they stand for.
-    pub(super) fn straighten(&mut self, h: f64) {
+    /// Takes the jumps of a grid of steps for the smooth line that they stand for: cubics whose slopes are those of the neighbours.
+    pub(super) fn smooth(&mut self, h: f64) {
         let n = self.pos.len();
-        for j in 0..n {
-            let slope = match self.pos.get(j + 1) {
-                Some(next) => (next - self.pos[j]) / h,
-                None => 0.0,
-            };
-            self.jump[j] = 0.0;
-            self.start_slope[j] = slope;
-            self.end_slope[j] = slope;
-        }
+        let at = |k: usize| {
+            self.pos
+                .get(k.min(n.saturating_sub(1)))
+                .copied()
+                .unwrap_or(0.0)
+        };
+        let slopes: Vec<f64> = (0..=n)
+            .map(|j| 0.5 * (at(j + 1) - at(j.saturating_sub(1))) / h)
+            .collect();
+        self.jump.fill(0.0);
+        self.start_slope.copy_from_slice(&slopes[..n]);
+        self.end_slope.copy_from_slice(&slopes[1..]);
     }
 }
 

@@ -43,7 +43,7 @@ pub(crate) fn records(records: &[Record], bead: bool) -> Result<(), ReconcileErr
     let seconds: f64 = moving.iter().map(|r| r.frames() as f64 * r.sample_s).sum();
     let rows: usize = records.iter().map(Record::frames).sum();
     let least = match bead {
-        true => THRESHOLDS.needed_rows,
+        true => THRESHOLDS.floor_rows,
         false => THRESHOLDS.needed_rows_of_others,
     };
     let needed = if bead && seconds < THRESHOLDS.needed_s {

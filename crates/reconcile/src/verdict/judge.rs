@@ -4,7 +4,7 @@ use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
 use crate::search::cost::{leaves_much, left_over, scatter};
 use crate::search::sequential::ids;
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;
 use crate::verdict::battery::{self, Column, Hypothesis};
 use crate::verdict::form::Aside;
@@ -75,7 +75,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         remainder: None,
     };
     if e.fit.parts.is_empty() {
-        let beyond = excess > THRESHOLDS.null_sd * scatter || e.null_flagged || term.is_some();
+        let beyond = excess > CHANCE_SD * scatter || e.null_flagged || term.is_some();
         if !e.floor.source.is_known() && beyond {
             out.verdict = Verdict::Unknown;
             out.reasons

@@ -1,7 +1,7 @@
 //! WHERE the model fails: the innovations by record and band, time and excitation, and a sentence about it.
 
 use crate::fit::context::{Context, Fit};
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::CHANCE_SD;
 use crate::verdict::response::{self, BandRatio, transform};
 use realfft::RealFftPlanner;
 
@@ -83,7 +83,7 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     let sigma = ctx.problem.noise.innovation_um();
     let edges_hz = band_edges_hz(sample_s);
     let bands = edges_hz.len() - 1;
-    let limit = THRESHOLDS.flag_sd;
+    let limit = CHANCE_SD;
     let mut planner = RealFftPlanner::<f64>::new();
     let mut rows = Vec::new();
     for (r, e) in ctx.problem.records.iter().zip(&fit.innovations) {

@@ -10,6 +10,7 @@ pub(crate) mod judge;
 pub(crate) mod map;
 mod names;
 mod parameters;
+mod profile;
 mod proposal;
 pub(crate) mod response;
 pub(crate) mod result;

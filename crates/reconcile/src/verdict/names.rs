@@ -7,7 +7,8 @@ use crate::search::cost::{prior_penalty, surely_left};
 use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::form;
-use crate::verdict::parameters::{parameters, told};
+use crate::verdict::parameters::{SURE, Sureness, parameters, told};
+use crate::verdict::profile;
 use crate::verdict::result::{Effect as NamedEffect, Interval};
 use crate::verdict::significance;
 use crate::verdict::split;
@@ -57,7 +58,7 @@ fn alternatives(
             let mut other = fit.parts.clone();
             other[index] = r.part.clone();
             let distance = |parts: &[Part]| w.distance(parts, &ctx.scope);
-            distance(&other) - distance(&fit.parts) > THRESHOLDS.white_decides
+            distance(&other) - distance(&fit.parts) > THRESHOLDS.tie
         });
         // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
         // unusual its size, unless what is left over says that the last percent decides nothing.
@@ -103,7 +104,14 @@ pub(crate) fn names(
         ambiguous: false,
         curvature: false,
     };
+    // A fit that leaves something over is less sure than its own curvature says.
+    let left = (1.0 + ((fit.chi2 - n) / n).max(0.0)).sqrt();
     let birge = split::birge(ctx, fit, threads);
+    let wide: Vec<f64> = birge.iter().map(|b| left * b).collect();
+    let sure = Sureness {
+        ends: profile::ends(ctx, fit, &wide, threads),
+        wide,
+    };
     for (i, part) in fit.parts.iter().enumerate() {
         let id = part.id();
         let mut parts = fit.parts.clone();
@@ -115,10 +123,10 @@ pub(crate) fn names(
         let rivals = rivals.get(i).map_or(&[][..], Vec::as_slice);
         let (alternatives, open) = alternatives(ctx, fit, i, rivals);
         out.ambiguous |= open;
-        let mut parameters = parameters(ctx, fit, i, (fit.chi2 - n) / n, &birge);
+        let mut parameters = parameters(ctx, fit, i, &sure);
         // Other valleys of the same equation that fit as well.
         for r in rivals {
-            if r.part.variant == part.variant && r.chi2 - fit.chi2 < THRESHOLDS.valley {
+            if r.part.variant == part.variant && r.chi2 - fit.chi2 < SURE * SURE {
                 for (p, value) in part.variant().params.iter().zip(r.part.natural()) {
                     if let Some(found) = parameters.get_mut(p.name) {
                         found.reach(told(ctx, part, p.name, value).value);

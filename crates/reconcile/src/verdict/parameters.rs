@@ -15,30 +15,41 @@ pub(crate) fn numeric_error(p: &FitParameter, x: f64) -> f64 {
     NUMERIC * if p.log { 1.0 } else { x.abs() }
 }
 
-/// Parameters of part `index` with 95 % intervals in their units; `birge` is by how much each number of the set scatters between the
-/// records beyond its uncertainty.
+/// Standard deviations of a normal distribution that hold 95 % of it.
+pub(crate) const SURE: f64 = 1.96;
+
+/// How sure the numbers of a set are.
+pub(crate) struct Sureness {
+    /// By how many times each is less sure than the likelihood says: it scatters between the records, or something is left over.
+    pub wide: Vec<f64>,
+    /// The ends by the profile of the likelihood, so much wider.
+    pub ends: Vec<Option<[f64; 2]>>,
+}
+
+/// Parameters of part `index` with 95 % intervals in their units.
 pub(crate) fn parameters(
     ctx: &Context<'_>,
     fit: &Fit,
     index: usize,
-    left_per_row: f64,
-    birge: &[f64],
+    sure: &Sureness,
 ) -> BTreeMap<String, Interval> {
     let offset: usize = fit.parts[..index]
         .iter()
         .map(|p| p.variant().params.len())
         .sum();
     let part = &fit.parts[index];
-    // A fit that leaves something over is less sure than its own curvature says.
-    let wide = (1.0 + left_per_row.max(0.0)).sqrt();
     let mut out = BTreeMap::new();
     for (j, p) in part.variant().params.iter().enumerate() {
         let x = part.theta[j];
-        let scatter = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt() * wide;
-        let sd = birge[offset + j] * scatter.hypot(numeric_error(p, x));
+        let wide = SURE * sure.wide[offset + j];
+        let sd = fit.covariance[(offset + j, offset + j)].max(0.0).sqrt();
+        let by_curvature = [x - wide * sd, x + wide * sd];
+        let [low, high] = sure.ends[offset + j].unwrap_or(by_curvature);
+        let numeric = wide * numeric_error(p, x);
         // What no record sees may be anything in its range.
         let (low, high) = if sd.is_finite() {
-            (p.natural(x - 1.96 * sd), p.natural(x + 1.96 * sd))
+            let end = |to: f64| (to - x).abs().hypot(numeric);
+            (p.natural(x - end(low)), p.natural(x + end(high)))
         } else {
             (p.lower, p.upper)
         };
@@ -103,7 +114,7 @@ fn tell(ctx: &Context<'_>, part: &Part, interval: &mut Interval) {
 fn about(value: f64, sd: f64, unit: &str) -> Interval {
     Interval {
         value,
-        ci95: [value - 1.96 * sd, value + 1.96 * sd],
+        ci95: [value - SURE * sd, value + SURE * sd],
         unit: unit.to_owned(),
     }
 }
@@ -137,7 +148,7 @@ fn wave_of_position(
 ) -> Vec<(String, Interval)> {
     if let Some(Some(exact)) = fit.locking.get(index) {
         let (amplitude, sd) = exact.amplitude_px();
-        let factor = (1.96 * exact.log_pixel_error().hypot(NUMERIC)).exp();
+        let factor = (SURE * exact.log_pixel_error().hypot(NUMERIC)).exp();
         let pixel = Interval {
             value: exact.pixel_um,
             ci95: [exact.pixel_um / factor, exact.pixel_um * factor],

@@ -3,7 +3,7 @@
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
 use crate::search::cost::threshold;
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;
 use crate::verdict::parameters::{numeric_error, told};
 use cellpos_plant::effects::Role;
@@ -13,8 +13,18 @@ type Group = (String, Mask);
 
 /// Halves of the time, and records one by one.
 fn groupings(ctx: &Context<'_>) -> Vec<Vec<Group>> {
+    let moving = moving(ctx);
+    let mut all = vec![halves(ctx)];
+    if moving.len() > 1 {
+        all.push(moving);
+    }
+    all
+}
+
+/// The two halves of the time.
+fn halves(ctx: &Context<'_>) -> Vec<Group> {
     let records = &ctx.problem.records;
-    let halves: Vec<Group> = [
+    [
         ("the first half of the time", 0),
         ("the second half of the time", 1),
     ]
@@ -29,13 +39,7 @@ fn groupings(ctx: &Context<'_>) -> Vec<Vec<Group>> {
             .collect();
         ((*name).to_owned(), mask)
     })
-    .collect();
-    let moving = moving(ctx);
-    let mut all = vec![halves];
-    if moving.len() > 1 {
-        all.push(moving);
-    }
-    all
+    .collect()
 }
 
 /// Records whose command moves, one by one.
@@ -53,12 +57,13 @@ fn moving(ctx: &Context<'_>) -> Vec<Group> {
 
 /// By how much the numbers of a set scatter between the records, in parts of what their uncertainties make of it, at least 1: the
 /// Birge ratio (Birge 1932, Phys. Rev. 40:207) of each number of each part. An equation that is not quite the rig's fits each
-/// excitation with another number, and is less sure than the curvature of the joint fit says.
+/// excitation with another number, and is less sure than the curvature of the joint fit says. Of one record, between its halves: a record
+/// that is cut in two says the same.
 pub(crate) fn birge(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<f64> {
     let numbers: usize = fit.parts.iter().map(|p| p.theta.len()).sum();
-    let groups = moving(ctx);
+    let mut groups = moving(ctx);
     if groups.len() < 2 {
-        return vec![1.0; numbers];
+        groups = halves(ctx);
     }
     let fits =
         cellpos_numeric::parallel::map(&groups, threads, |(_, mask)| ctx.refit(fit, mask, 6));
@@ -124,7 +129,7 @@ pub(crate) fn disagreement(
             .iter()
             .map(|(joint, own)| (joint - own.chi2).max(0.0))
             .sum();
-        let enough = threshold(freedom.max(1)).max(THRESHOLDS.split_gain * gained);
+        let enough = threshold(freedom.max(1)).max(THRESHOLDS.term_share * gained);
         if better < enough {
             continue;
         }
@@ -145,7 +150,7 @@ pub(crate) fn disagreement(
                     // The weights of a sum are its size together.
                     let of_size = j == 0 || p.name == "weights";
                     if a.variant().role == Role::Chain
-                        && moved > THRESHOLDS.split_sd * sd
+                        && moved > CHANCE_SD * sd
                         && share > THRESHOLDS.split_share
                         && worst.as_ref().is_none_or(|w| (of_size, share) > (w.0, w.1))
                     {

@@ -6,6 +6,7 @@ use cellpos_ident::sampled::Hold;
 use cellpos_plant::effects::Definition;
 use cellpos_plant::{Model, Noise, SimulateOptions, TransferFunction, effects, simulate};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
 fn data() -> PathBuf {
@@ -186,7 +187,7 @@ fn a_hair_dryer_with_its_delay_has_no_name_missing() {
 }
 
 /// A rough linear model of a plant of which 500 rows are too few for `identify`.
-fn rough(num: f64, den: &[f64], at_rest: f64) -> Model {
+pub(super) fn rough(num: f64, den: &[f64], at_rest: f64) -> Model {
     Model {
         name: "rough".to_owned(),
         plant: TransferFunction::new(vec![num], den.to_vec()).unwrap(),
@@ -286,25 +287,29 @@ fn mean_error(model: &Model, s: &Set, u: &[f64], y: &[f64]) -> f64 {
 }
 
 pub(super) fn free_response(model: &Model, hold: Hold, sample_s: f64, u: &[f64]) -> Vec<f64> {
-    /// A sampled input goes on smoothly: so many steps a row come close to that.
+    /// A sampled input holds nothing above half its rate: so many steps a row, each from so many samples on each side, come close to that.
     const STEPS: usize = 20;
+    const SIDE: isize = 24;
     let options = SimulateOptions::default();
     if hold != Hold::None {
         return simulate(model, u, sample_s, &options).unwrap();
     }
     let at = |k: isize| u[k.clamp(0, u.len() as isize - 1) as usize];
+    // A sinc under the arch of another, of 24 samples on each side: it lets all through that is below 0.97 of half the rate.
+    let sinc = |x: f64| (PI * x).sin() / (PI * x);
+    let weights: Vec<Vec<f64>> = (0..STEPS)
+        .map(|i| {
+            let f = (i as f64 + 0.5) / STEPS as f64;
+            let w =
+                (1 - SIDE..=SIDE).map(|m| sinc(f - m as f64) * sinc((f - m as f64) / SIDE as f64));
+            w.collect()
+        })
+        .collect();
     let fine: Vec<f64> = (0..u.len() as isize)
         .flat_map(|k| {
-            let [p0, p1, p2, p3] = [at(k - 1), at(k), at(k + 1), at(k + 2)];
-            (0..STEPS).map(move |i| {
-                let f = (i as f64 + 0.5) / STEPS as f64;
-                // Catmull and Rom.
-                p1 + 0.5
-                    * f
-                    * (p2 - p0
-                        + f * (2.0 * p0 - 5.0 * p1 + 4.0 * p2 - p3
-                            + f * (3.0 * (p1 - p2) + p3 - p0)))
-            })
+            let near: Vec<f64> = (1 - SIDE..=SIDE).map(|m| at(k + m)).collect();
+            let one = move |w: &Vec<f64>| w.iter().zip(&near).map(|(w, u)| w * u).sum::<f64>();
+            weights.iter().map(one).collect::<Vec<_>>()
         })
         .collect();
     let y = simulate(model, &fine, sample_s / STEPS as f64, &options).unwrap();

@@ -350,7 +350,7 @@ fn a_layer_knows_only_what_stands_below_it() {
             &["plant", "vision", "link", "board", "rig", "drivers"],
         ),
         ("ident", &["plant"]),
-        ("reconcile", &["plant", "report"]),
+        ("reconcile", &["plant", "ident", "report"]),
         ("live", &[]),
         (
             "session",

@@ -83,7 +83,6 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             ));
         }
     }
-    each_its_own_noise(&found)?;
     // A run that was resumed has a record for each of its sessions.
     Ok((found.iter())
         .flat_map(|path| match is_run(path) {
@@ -93,29 +92,36 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
         .collect())
 }
 
-/// Runs of the emulated rig with one seed share one noise: the second would confirm whatever fits the noise of the first.
-fn each_its_own_noise(found: &[PathBuf]) -> Result<(), Failure> {
-    let mut seeds: BTreeMap<u64, &Path> = BTreeMap::new();
-    for path in found.iter().filter(|path| is_run(path)) {
-        let run = RunReader::open(path).map_err(Failure::input)?;
+/// Runs of the emulated rig, by their seed.
+#[derive(Debug, Default)]
+pub(super) struct Noises(BTreeMap<u64, PathBuf>);
+
+impl Noises {
+    /// Takes a run of its own noise; sessions of one run belong together. Runs of the emulated rig with one seed share one noise: the
+    /// second would confirm whatever fits the noise of the first.
+    pub(super) fn add(&mut self, path: &Path, run: &RunReader) -> Result<(), Failure> {
         let Some(seed) = run.meta().ok().and_then(|meta| meta.seed) else {
-            continue;
+            return Ok(());
         };
-        if let Some(first) = seeds.insert(seed, path) {
-            return Err(Failure::bad_input(
-                format!(
-                    "--data: {} and {} are runs of the emulated rig with the same `seed` = {seed}: they share one noise",
-                    first.display(),
-                    path.display()
-                ),
-                format!(
-                    "record one of them again with --seed {}",
-                    seed.wrapping_add(1)
-                ),
-            ));
+        let Some(first) = self.0.get(&seed) else {
+            self.0.insert(seed, path.to_owned());
+            return Ok(());
+        };
+        if path != first && path.starts_with(first) {
+            return Ok(());
         }
+        Err(Failure::bad_input(
+            format!(
+                "--data: {} and {} are runs of the emulated rig with the same `seed` = {seed}: they share one noise",
+                first.display(),
+                path.display()
+            ),
+            format!(
+                "record one of them again with --seed {}",
+                seed.wrapping_add(1)
+            ),
+        ))
     }
-    Ok(())
 }
 
 pub(super) fn is_run(path: &Path) -> bool {
@@ -144,8 +150,7 @@ pub(super) fn read(path: &Path, columns: &Columns, held: bool) -> Result<Record,
 
 /// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them; and where
 /// its bead rested.
-pub(super) fn read_run(path: &Path) -> Result<(Record, Option<f64>), Failure> {
-    let run = RunReader::open(path).map_err(Failure::input)?;
+pub(super) fn read_run(path: &Path, run: &RunReader) -> Result<(Record, Option<f64>), Failure> {
     let record = run.to_record().map_err(Failure::input)?;
     let time_s: Vec<f64> = (0..record.len())
         .map(|k| record.start_s + k as f64 * record.step_s)

@@ -1,0 +1,59 @@
+//! What is no noise in a record that shows nothing else: jumps, and lines at the mains.
+
+use std::f64::consts::TAU;
+
+/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):
+/// a bead that jumps is no noise, and must not raise the floor under which its jumps would then hide.
+pub(super) fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
+    let mut sizes: Vec<f64> = (1..e.len())
+        .filter(|&k| present[k] && present[k - 1])
+        .map(|k| (e[k] - e[k - 1]).abs())
+        .collect();
+    if sizes.is_empty() {
+        return present.to_vec();
+    }
+    let middle = sizes.len() / 2;
+    let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
+    let limit = 6.0 * 1.4826 * *median;
+    (0..e.len())
+        .map(|k| {
+            let jumps = k > 0 && limit > 0.0 && (e[k] - e[k - 1]).abs() > limit;
+            present[k] && !jumps
+        })
+        .collect()
+}
+
+/// Takes lines at 50 and 60 Hz and their second harmonics off; and how many numbers were fitted for that.
+pub(super) fn without_lines(e: &[f64], present: &[bool], sample_s: f64) -> (Vec<f64>, usize) {
+    let (mut clean, mut fitted) = (e.to_vec(), 0);
+    for hz in [50.0, 60.0, 100.0, 120.0] {
+        if hz * sample_s > 0.45 {
+            continue;
+        }
+        // On increments, where the walk does not leak into the line.
+        let (mut ss, mut cc, mut sc, mut se, mut ce) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for k in 1..clean.len() {
+            if present[k] && present[k - 1] {
+                let w = TAU * hz * sample_s;
+                let (s1, c1) = (w * k as f64).sin_cos();
+                let (s0, c0) = (w * (k - 1) as f64).sin_cos();
+                let (s, c, d) = (s1 - s0, c1 - c0, clean[k] - clean[k - 1]);
+                ss += s * s;
+                cc += c * c;
+                sc += s * c;
+                se += s * d;
+                ce += c * d;
+            }
+        }
+        let det = ss * cc - sc * sc;
+        if det > 1e-12 {
+            fitted += 2;
+            let (a, b) = ((cc * se - sc * ce) / det, (ss * ce - sc * se) / det);
+            for (k, v) in clean.iter_mut().enumerate() {
+                let (s, c) = (TAU * hz * sample_s * k as f64).sin_cos();
+                *v -= a * s + b * c;
+            }
+        }
+    }
+    (clean, fitted)
+}
