@@ -7,6 +7,7 @@ mod measured;
 mod measured_piezo;
 mod noise;
 mod nulls;
+mod same;
 mod traits;
 mod units;
 mod verdicts;

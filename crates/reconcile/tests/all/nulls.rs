@@ -36,7 +36,7 @@ fn made_again(s: &Set, model: &Model, of: usize, seed: u64) -> Set {
 }
 
 /// The base that the command fits to a record, of an order at most.
-fn base(s: &Set, of: usize) -> Model {
+pub(super) fn base(s: &Set, of: usize) -> Model {
     let (_, u, y) = &s.files[of];
     let series = Series {
         input: u.clone(),
@@ -86,7 +86,7 @@ fn verdicts(sets: &[Set], seeds: std::ops::Range<u64>) -> [usize; 3] {
 }
 
 /// Every set of measured records, with linear models of an order.
-fn sets(order: usize) -> Vec<Set> {
+pub(super) fn sets(order: usize) -> Vec<Set> {
     let held = Hold::ZeroOrder;
     vec![
         set("hair-dryer", &["dryer"], ("u_V", "y_V"), 0.08, order, held),
