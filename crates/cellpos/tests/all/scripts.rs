@@ -443,3 +443,47 @@ fn a_script_that_wants_clips_says_where_there_are_no_pictures() {
         assert_eq!(err.contains("no clip is kept"), said, "{err}");
     }
 }
+
+#[test]
+fn a_mark_and_a_cycle_behind_a_wait_begin_when_it_is_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut script = "name = \"late\"\n".to_owned();
+    for step in [
+        "do = \"hold\"\nduration = \"1s\"",
+        "do = \"mark\"\ntext = \"before\"",
+        "do = \"wait\"\nfor = \"position\"\nabove = \"5um\"\ntimeout = \"2s\"\non_timeout = \"continue\"",
+        "do = \"mark\"\ntext = \"after\"",
+        "do = \"trapezoid\"\namplitude = \"3um\"\nfrequency = \"2Hz\"\ncycles = 2",
+    ] {
+        script += &format!("[[step]]\n{step}\n");
+    }
+    std::fs::write(folder.path().join("late.toml"), script).unwrap();
+    let args = ["run", "late.toml", "--dry", "--frames", "off", "--json"];
+    json(folder.path(), &args);
+    let mut runs = std::fs::read_dir(folder.path().join("runs")).unwrap();
+    let run = runs.next().unwrap().unwrap().path();
+    let events = std::fs::read_to_string(run.join("events.jsonl")).unwrap();
+    let at_s = |what: &str| {
+        let line = events.lines().find(|line| line.contains(what)).unwrap();
+        let event: Value = serde_json::from_str(line).unwrap();
+        event["time_s"].as_f64().unwrap()
+    };
+    let waiting_s = at_s("\"stage\":\"waiting\"");
+    assert!((at_s("\"text\":\"before\"") - waiting_s).abs() < 2e-3);
+    assert!((at_s("\"text\":\"after\"") - waiting_s - 2.0).abs() < 5e-3);
+    let table = std::fs::read_to_string(run.join("cycles.csv")).unwrap();
+    let mut rows = table.lines().map(|row| row.split(',').collect::<Vec<_>>());
+    let names = rows.next().unwrap();
+    let column = |row: &[&str], name: &str| -> f64 {
+        row[names.iter().position(|n| *n == name).unwrap()]
+            .parse()
+            .unwrap()
+    };
+    let first = rows.next().unwrap();
+    assert!((column(&first, "ticks") - 500.0).abs() <= 2.0, "{first:?}");
+    assert!(
+        (column(&first, "start_s") - waiting_s - 2.0).abs() < 5e-3,
+        "{first:?}"
+    );
+    assert!(!first.contains(&"waited"), "{first:?}");
+}

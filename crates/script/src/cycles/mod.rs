@@ -246,6 +246,10 @@ impl CycleTable {
         if !(start_ns..end_ns).contains(&place.plan_ns) {
             return;
         }
+        // During a wait or a pause before its first motion the plan's clock stands at the start of a cycle: none of it is the cycle's.
+        if self.open.is_none() && place.stage != Stage::Running {
+            return;
+        }
         let since_ns = self.open.as_ref().and_then(Open::last_seen_ns);
         let flow_um = self.away_from_neutral_um(since_ns, place.exposed_ns);
         let open = self

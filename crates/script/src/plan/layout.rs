@@ -231,6 +231,8 @@ impl Layout<'_> {
                 if self.plan.marks.len() < MAX_SEGMENTS {
                     self.plan.marks.push(Mark {
                         time_s: self.time_s,
+                        after_wait: (self.plan.waits.last())
+                            .is_some_and(|(_, wait_s)| *wait_s == self.time_s),
                         text: text.clone(),
                     });
                 }

@@ -70,6 +70,8 @@ pub struct Segment {
 pub struct Mark {
     /// When, s.
     pub time_s: f64,
+    /// Whether a wait at the same time of the plan is before it: it comes when that wait is over.
+    pub after_wait: bool,
     /// What to write.
     pub text: String,
 }

@@ -388,7 +388,8 @@ impl RunSink for ScriptSink {
         }
         if matches!(stage, Stage::Running | Stage::Waiting | Stage::Done) {
             while let Some(mark) = self.plan.marks().get(self.next_mark) {
-                if mark.time_s * 1e9 > record.plan_ns as f64 + 0.5 {
+                let waits = mark.after_wait && stage == Stage::Waiting;
+                if waits || mark.time_s * 1e9 > record.plan_ns as f64 + 0.5 {
                     break;
                 }
                 let event = LogEvent::new(time_s, "mark")
