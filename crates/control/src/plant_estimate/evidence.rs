@@ -6,11 +6,8 @@
 //! That variance is measured in blocks that are longer than the correlation of `x`, so it includes the colour of the disturbance.
 
 use super::belief::{Belief, Finding, Likelihood};
-use super::motion::{Frame, MEMBERS};
+use super::motion::{BLOCK, Frame, MEMBERS};
 
-/// Fixes of a block. Whitened binary dither is correlated with itself over 3 ticks; a block of five times that has all but a tenth of
-/// the correlation of neighbouring products.
-pub(super) const BLOCK: u32 = 16;
 /// Memory of all that is known of the noise, and of how the commands follow the motion that was chosen, fixes: two seconds at 1 kHz. The
 /// variance of the products is then known to 6 %.
 pub(super) const MEMORY_FIXES: f64 = 2048.0;

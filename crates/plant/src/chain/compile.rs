@@ -73,6 +73,9 @@ impl Builder {
     fn push(&mut self, block: Box<dyn Block>) {
         self.flush();
         self.needs_slopes |= block.needs_slopes();
+        if let Some(longest_s) = block.longest_s() {
+            self.substep_s = self.substep_s.min(longest_s.max(SHORTEST_S));
+        }
         if block.bends() && self.moving {
             let wanted = PART_OF_TIME_CONSTANT / self.fastest.max(1.0);
             self.substep_s = self.substep_s.min(wanted.clamp(SHORTEST_S, LONGEST_S));

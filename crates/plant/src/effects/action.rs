@@ -85,6 +85,11 @@ pub trait Block: fmt::Debug + Send + Sync {
         false
     }
 
+    /// Longest time step with which it is right, s.
+    fn longest_s(&self) -> Option<f64> {
+        None
+    }
+
     /// Whether a straight input can give a curved output: a moving input is then advanced in short pieces.
     fn bends(&self) -> bool {
         true

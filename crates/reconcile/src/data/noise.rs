@@ -473,7 +473,6 @@ mod tests {
         let filter = Whitener::new(&n, &[true; 3], None);
         let expected = (variance * variance - next * next).ln();
         assert!((filter.log_determinant() - expected).abs() < 1e-12);
-        // And their sum of squares.
         let y = [0.3, 0.41, 0.37];
         let (a, b) = (y[1] - y[0], y[2] - y[1]);
         let by_hand =

@@ -9,6 +9,7 @@ pub(super) struct Inline {
     pub core: Core,
     /// The signal is the bead's: its slope is a velocity.
     pub of_bead: bool,
+    pub step_s: Option<f64>,
 }
 
 impl Inline {
@@ -45,6 +46,10 @@ impl Block for Inline {
 
     fn needs_slopes(&self) -> bool {
         self.of_bead
+    }
+
+    fn longest_s(&self) -> Option<f64> {
+        self.step_s
     }
 }
 

@@ -22,6 +22,9 @@ use definition::{Compiled, MOST_STATES};
 use nalgebra::{Complex, DMatrix, DVector};
 use std::sync::Arc;
 
+/// Size of a motion about rest, um.
+const SMALL_UM: f64 = 0.01;
+
 /// A user-defined effect as a kind of effect.
 #[derive(Debug)]
 struct UserKind {
@@ -160,6 +163,22 @@ impl UserKind {
     }
 }
 
+impl UserKind {
+    /// Longest time step, s: the one that the definition states, or a fifth of the fastest time constant of its states at rest.
+    fn step_s(&self, effect: &Effect) -> Option<f64> {
+        const PART_OF_TIME_CONSTANT: f64 = 0.2;
+        self.definition.step_s.or_else(|| {
+            let slopes = self.core(effect).slopes(SMALL_UM);
+            let states = slopes.states.min(MOST_STATES);
+            // No eigenvalue is larger than the largest sum of a row.
+            let row = |rates: &[f64]| rates[3..3 + states].iter().map(|r| r.abs()).sum::<f64>();
+            let fastest =
+                (slopes.rates[..states].iter()).fold(0.0_f64, |most, rates| most.max(row(rates)));
+            (fastest > 0.0).then(|| PART_OF_TIME_CONSTANT / fastest)
+        })
+    }
+}
+
 impl EffectKind for UserKind {
     fn spec(&self) -> &'static Spec {
         self.spec
@@ -172,12 +191,13 @@ impl EffectKind for UserKind {
                 Action::Block(Box::new(blocks::Inline {
                     core,
                     of_bead: site == Site::Bead,
+                    step_s: self.step_s(effect),
                 }))
             }
             site @ (Site::Chip | Site::Plant) => Action::Around(Box::new(blocks::Tied {
                 core,
                 replaces: site == Site::Plant,
-                step_s: self.definition.step_s,
+                step_s: self.step_s(effect),
             })),
             Site::Camera => Action::Show(Box::new(blocks::Pictured { core })),
         }
@@ -199,10 +219,9 @@ impl EffectKind for UserKind {
         Some(&self.definition)
     }
 
-    /// By central differences of 0.01 um about rest.
+    /// By central differences about rest.
     fn small_motion(&self, effect: &Effect, s: Complex<f64>) -> Option<[Complex<f64>; 3]> {
-        const SIZE: f64 = 0.01;
-        let slopes = self.core(effect).slopes(SIZE);
+        let slopes = self.core(effect).slopes(SMALL_UM);
         let n = slopes.states.min(MOST_STATES);
         let resolvent = DMatrix::from_fn(n, n, |i, j| {
             let own = if i == j { s } else { Complex::new(0.0, 0.0) };

@@ -55,38 +55,38 @@ width = { unit = "um", lower = 0.0, upper = 5.0, start = 0.1 }
 }
 
 #[test]
-fn a_lag_written_down_as_a_state_is_the_lag_of_the_driver() {
-    define(
-        r#"
+fn a_lag_written_down_as_a_state_is_the_lag_of_the_driver_wherever_it_is() {
+    for (place, step) in [("chip", "step_s = 1e-4"), ("driver", ""), ("pzt", "")] {
+        define(&format!(
+            r#"
 [[effects]]
-id = "own-lag"
-place = "chip"
+id = "own-lag-{place}"
+place = "{place}"
 output = "reached"
-step_s = 1e-4
+{step}
 [effects.states]
-reached = { rate = "(input - reached)/lag", start = "0" }
+reached = {{ rate = "(input - reached)/lag", start = "0" }}
 [effects.parameters]
-lag = { unit = "s", lower = 1e-4, upper = 1.0, start = 0.01 }
-"#,
-    );
-    let lag_s = 1.0 / (TAU * 20.0);
-    let u: Vec<f64> = sine(3.0, 1.0, 1e-3, 2000).iter().map(|u| 4.0 + u).collect();
-    let own = run(
-        &Model::eq6().with_effect(effect("own-lag", &[("lag", lag_s)])),
-        &u,
-        1e-3,
-    );
-    let of_catalogue = run(
-        &Model::eq6().with_effect(effects::driver_lag(20.0)),
-        &u,
-        1e-3,
-    );
-    assert!(
-        apart(&own, &of_catalogue) < 1e-3 * size(&of_catalogue),
-        "{} of {}",
-        apart(&own, &of_catalogue),
-        size(&of_catalogue)
-    );
+lag = {{ unit = "s", lower = 1e-4, upper = 1.0, start = 0.01 }}
+"#
+        ));
+        for bandwidth_hz in [20.0, 200.0] {
+            let lag_s = 1.0 / (TAU * bandwidth_hz);
+            let u: Vec<f64> = sine(3.0, 0.05 * bandwidth_hz, 1e-3, 2000)
+                .iter()
+                .map(|u| 4.0 + u)
+                .collect();
+            let own = effect(&format!("own-lag-{place}"), &[("lag", lag_s)]);
+            let own = run(&Model::eq6().with_effect(own), &u, 1e-3);
+            let lag = effects::driver_lag(bandwidth_hz);
+            let of_catalogue = run(&Model::eq6().with_effect(lag), &u, 1e-3);
+            let (apart, size) = (apart(&own, &of_catalogue), size(&of_catalogue));
+            assert!(
+                apart < 1e-3 * size,
+                "{place}, {bandwidth_hz} Hz: {apart} of {size}"
+            );
+        }
+    }
 }
 
 /// The Duffing equation `y'' + 20 y' + 400 y + 400 c y^3 = 400 u` by Runge and Kutta.
