@@ -1,11 +1,9 @@
 //! A step of the flow, as a hypothesis next to the quiet walk of neutral.
 //!
-//! A tap on the syringe or a valve moves neutral at once as far as the walk does in minutes. Three hypotheses compete for the innovations
-//! of the last fixes. In a quiet flow their sum has a normal density, but for what a wrong gain makes of the commands: the one that
-//! explains most of the last second. After a step of the flow, at any time since the last one, it may have any magnitude on a logarithmic
-//! scale: a fast flow shows in one fix, a slow one in some ten milliseconds. Or the gain has changed at that time, which is as rare: then
-//! the innovations go with the commands, while those of a flow are the same in every tick. If the step is the likeliest, neutral moves by
-//! the step that explains the sum.
+//! A tap on the syringe or a valve moves neutral at once as far as the walk does in minutes. Two hypotheses compete for the innovations of
+//! the last fixes. In a quiet flow their sum has a normal density. After a step of the flow before any one fix it may have any magnitude
+//! on a logarithmic scale. A fast flow shows in one fix, a slow one in several. If the step is likelier, neutral moves by the step that
+//! explains the sum.
 
 use super::covariance::corrected;
 use super::{Estimator, EstimatorState, Fix, HISTORY};
@@ -21,102 +19,29 @@ const LEAST_OFF_UM: f64 = 1e-3;
 /// Gain of a plant over that of its model, of either sign, that is told from a step of the flow: a gain that jumps from half to twice is
 /// four times what the law has followed.
 const WRONG_GAIN: f64 = 4.0;
-/// Time in which what was seen of the gain is forgotten, s: a hold tells it to 10 % in that time, for commands answer the walk.
-const GAIN_MEMORY_S: f64 = 1.0;
-/// Times at which the flow may have stepped that are kept, newest first.
-const ONSETS: usize = 40;
-/// They lie closer than this share of the time since then: the way that a flow has made since is then right to a 16th.
-const APART: f64 = 0.125;
 
-/// What the fixes showed since each time at which the flow may have stepped, newest first, and what they show of the gain.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// What the last fixes showed, newest first, since the zero flow was last believed to be quiet.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RecentFixes {
-    onsets: [Onset; ONSETS],
+    fixes: [RecentFix; HISTORY],
     count: usize,
-    gain: SeenGain,
 }
 
-/// What the fixes show of the gain: sums of innovation times motion and of motion squared, um^2.
+/// How far the bead went from one fix to the next.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct SeenGain {
-    by_motion_um2: f64,
-    motion_um2: f64,
-}
-
-impl SeenGain {
-    fn add(&mut self, by_motion_um2: f64, motion_um2: f64) {
-        self.by_motion_um2 += by_motion_um2;
-        self.motion_um2 += motion_um2;
-    }
-
-    /// Sum of the squares of innovations that the likeliest gain explains, um^2.
-    fn explained_um2(&self) -> f64 {
-        if self.motion_um2 <= 0.0 {
-            return 0.0;
-        }
-        let more =
-            (self.by_motion_um2 / self.motion_um2).clamp(-WRONG_GAIN - 1.0, WRONG_GAIN - 1.0);
-        more * (2.0 * self.by_motion_um2 - more * self.motion_um2)
-    }
-}
-
-/// How far the bead went off its prediction since a time.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Onset {
-    /// Sum of the innovations, um.
-    way_um: f64,
+struct RecentFix {
+    /// Fix less its prediction, um.
+    innovation_um: f64,
+    /// The way that the commands account for, um.
+    motion_um: f64,
     ticks: f64,
-    gain: SeenGain,
-}
-
-impl Default for RecentFixes {
-    fn default() -> Self {
-        Self {
-            onsets: [Onset::default(); ONSETS],
-            count: 0,
-            gain: SeenGain::default(),
-        }
-    }
 }
 
 impl RecentFixes {
-    /// Takes in a fix: its innovation and the way that the commands account for, um, and the ticks that it is of.
-    fn push(&mut self, innovation_um: f64, motion_um: f64, ticks: f64, sample_s: f64) {
-        let (by_motion_um2, motion_um2) = (innovation_um * motion_um, motion_um * motion_um);
-        let kept = (1.0 - ticks * sample_s / GAIN_MEMORY_S).max(0.0);
-        self.gain.by_motion_um2 *= kept;
-        self.gain.motion_um2 *= kept;
-        self.gain.add(by_motion_um2, motion_um2);
-        self.thin();
-        self.onsets.copy_within(0..self.count, 1);
-        self.onsets[0] = Onset::default();
-        self.count += 1;
-        for onset in &mut self.onsets[..self.count] {
-            onset.way_um += innovation_um;
-            onset.ticks += ticks;
-            onset.gain.add(by_motion_um2, motion_um2);
-        }
-    }
-
-    /// Makes room for one more: leaves out those whose neighbours are close enough, and the oldest if that does not do.
-    fn thin(&mut self) {
-        let mut kept = usize::from(self.count > 0);
-        for k in 1..self.count {
-            let last = k + 1 == self.count;
-            let next = self.onsets[(k + 1).min(ONSETS - 1)].ticks;
-            if last || next - self.onsets[kept - 1].ticks > APART * next {
-                self.onsets[kept] = self.onsets[k];
-                kept += 1;
-            }
-        }
-        self.count = kept.min(ONSETS - 1);
-    }
-
-    /// The flow is believed from now on; what an onset explained says nothing of the gain.
-    fn explained(&mut self, since: SeenGain) {
-        self.gain.add(-since.by_motion_um2, -since.motion_um2);
-        self.gain.motion_um2 = self.gain.motion_um2.max(0.0);
-        self.count = 0;
+    fn push(&mut self, fix: RecentFix) {
+        self.fixes.copy_within(0..HISTORY - 1, 1);
+        self.fixes[0] = fix;
+        self.count = (self.count + 1).min(HISTORY);
     }
 
     pub(super) fn forget(&mut self) {
@@ -133,7 +58,6 @@ pub(super) struct FlowStep {
     /// Ticks since then, and those of the newest fix.
     ticks: f64,
     newest_ticks: f64,
-    gain: SeenGain,
 }
 
 /// Natural logarithm of the density (1/um) of a fix that is `off_um` from where a quiet flow would have it, if the flow has stepped
@@ -158,46 +82,45 @@ impl Estimator {
             state.recent.forget();
             return None;
         }
+        state.recent.push(RecentFix {
+            innovation_um,
+            motion_um,
+            ticks: f64::from(state.ticks_since_fix.max(1)),
+        });
         let sample_s = self.model.sample_time_s;
-        let newest_ticks = f64::from(state.ticks_since_fix.max(1));
-        (state.recent).push(innovation_um, motion_um, newest_ticks, sample_s);
         let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * sample_s;
         // What is not known of neutral carries the bead the same way in every tick.
         let unsure_um2 = self.tick.gain.powi(2) * state.covariance_um2[2];
         let swing_um = WRONG_GAIN * self.commanded_swing(state);
         // Of a fix that is not of its nominal time the tick may have come late as well, and the walk of a tick is in doubt.
         let late = fix.age > 0 || fix.offset != 0.0;
-        let newest_um2 = variance_um2 + if late { walk_um2 } else { 0.0 };
-        let tick_um2 = walk_um2 + state.spread_um2;
-        // A quiet flow with the gain that explains most.
-        let by_gain = state.recent.gain.explained_um2() / tick_um2;
+        let mut variance_um2 = variance_um2 + if late { walk_um2 } else { 0.0 };
+        let newest_ticks = state.recent.fixes[0].ticks;
+        let (mut way_um, mut motion_um, mut ticks) = (0.0, 0.0, 0.0);
         let mut best: Option<(f64, FlowStep)> = None;
-        let mut before = 0.0;
-        for onset in &state.recent.onsets[..state.recent.count] {
-            let &Onset {
-                way_um,
-                ticks,
-                gain,
-            } = onset;
-            let between = ticks - std::mem::replace(&mut before, ticks);
-            let variance_um2 = newest_um2
-                + tick_um2 * (ticks - newest_ticks)
-                + unsure_um2 * (ticks * ticks - newest_ticks * newest_ticks);
-            // A gain that changed at that time is as rare as a step.
-            let changed = gain.explained_um2() * ticks > way_um * way_um;
-            let off = way_um * way_um / variance_um2 - by_gain;
-            if changed || off <= 0.0 || way_um.abs() <= swing_um {
+        for (back, recent) in state.recent.fixes[..state.recent.count].iter().enumerate() {
+            way_um += recent.innovation_um;
+            motion_um += recent.motion_um;
+            ticks += recent.ticks;
+            if back > 0 {
+                let before = ticks - recent.ticks;
+                variance_um2 += (walk_um2 + state.spread_um2) * recent.ticks
+                    + unsure_um2 * (ticks * ticks - before * before);
+            }
+            let by_gain = [-WRONG_GAIN - 1.0, WRONG_GAIN - 1.0].map(|more| more * motion_um);
+            let low_um = by_gain[0].min(by_gain[1]) - swing_um;
+            let high_um = by_gain[0].max(by_gain[1]) + swing_um;
+            if (low_um..=high_um).contains(&way_um) {
                 continue;
             }
-            let quiet = -0.5 * (off + (TAU * variance_um2).ln());
-            let odds = flow_step_log_density(way_um, between * sample_s) - quiet;
+            let quiet = -0.5 * (way_um * way_um / variance_um2 + (TAU * variance_um2).ln());
+            let odds = flow_step_log_density(way_um, recent.ticks * sample_s) - quiet;
             if odds > best.map_or(0.0, |(odds, _)| odds) {
                 let step = FlowStep {
                     way_um,
                     variance_um2,
                     ticks,
                     newest_ticks,
-                    gain,
                 };
                 best = Some((odds, step));
             }
@@ -226,7 +149,7 @@ impl Estimator {
         innovation_um: f64,
     ) -> f64 {
         state.stepped_ticks = HISTORY as u8;
-        state.recent.explained(step.gain);
+        state.recent.forget();
         // Per um of way: of the newest fix's prediction, and of neutral.
         let newest = step.newest_ticks / step.ticks;
         let neutral = -1.0 / (self.tick.gain * step.ticks);
