@@ -74,6 +74,7 @@ fn a_leak_is_named_although_the_command_runs_away_with_the_drift_of_the_zero_flo
 }
 
 #[test]
+#[ignore = "slow: a third of a minute of processor time; for the nightly run"]
 fn a_bead_that_sticks_does_so_in_the_flow_and_nothing_is_named_beside_it() {
     // The command follows the zero flow. A wall that acts on the command alone leaves a leak or a flow to be named.
     let adhesion = Hidden::Adhesion(40.0);
