@@ -15,7 +15,7 @@ pub(crate) const CHANCE_SD: f64 = 4.056;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Thresholds {
     /// Factor, for the error of the noise estimate, on what an addition must gain in twice the log-likelihood: the quantile of chi-square
-    /// with its degrees of freedom at [`CHANCE_SD`]. Pinned by `records_that_hide_nothing_get_no_name`.
+    /// with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
     /// What a response to the command must gain beside others, in parts of what is explained already: the equations of the
     /// first effect are not those of nature to the last digit. Pinned by the tests' simulator (relays for play operators).
