@@ -123,8 +123,8 @@ impl Adapter {
             Some(found) => (found.gain.max(0.0), found.delay),
             None => (gain, late),
         };
-        let believed_frame = frame.of(believed.1);
-        let moved = |p: &[f64; MEMBERS]| believed.0 * dot(p, &believed_frame);
+        let believed_weights = frame.of(believed.1);
+        let moved = |p: &[f64; MEMBERS]| believed.0 * dot(p, &believed_weights);
         let far = (y - moved(&p)).abs() / (FAR * usual_um2.sqrt());
         // The error of the model along a reference is not a line.
         let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));

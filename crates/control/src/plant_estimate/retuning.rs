@@ -27,7 +27,7 @@ pub enum AdaptMode {
 pub(super) const DELAYS: [f64; TUNINGS] = [-1.0, -0.5, 0.0, 0.5, 1.0, 1.5];
 /// How many, and half the step between two.
 pub(super) const TUNINGS: usize = 6;
-const HALF_STEP: f64 = 0.25;
+const HALF_STEP: f64 = 0.5 * (DELAYS[1] - DELAYS[0]);
 /// The design's own among them.
 pub(super) const NOMINAL: usize = 2;
 /// Largest gain over the design's that the law is tuned to, and largest design's over the gain.
