@@ -1,20 +1,22 @@
 //! `cellpos check`: a setpoint script against a model and the rig's limits, before anything moves.
 
+use super::run::possible;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
-use crate::rig_file::RigFile;
-use crate::setup;
 use cellpos_numeric::units::{Micrometers, MicrometersPerSecond};
-use cellpos_plant::Model;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
-use cellpos_script::{Check, CheckLimits, Script, check};
+use cellpos_script::{Check, CheckLimits, Plan, Script};
+use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
+use cellpos_session::setup::{self, Prepared};
+use cellpos_session::{Options, Rig, connect};
 use std::path::PathBuf;
 
 /// Arguments of `cellpos check`.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Example:\n  cellpos check examples/scripts/fatigue.toml --model eq6 --report fatigue.html\n\n\
-                  Exit code 0: the script can run; 1: the rig cannot do it; 2: the script has an error."
+                  Exit code 0: the script can run; 1: the rig cannot do it; 2: the script has an error.\n\
+                  `cellpos run` and `run --dry` refuse what this check refuses, in the same words."
 )]
 pub(crate) struct Args {
     /// The script.
@@ -22,7 +24,10 @@ pub(crate) struct Args {
     /// `eq6`, or a model file.
     #[arg(long, default_value = "eq6")]
     model: String,
-    /// Rig file with the limits; default: 0um to 40um, zero flow at 20um, 10000um/s, view from -50um to 50um.
+    /// Controller with limits of its own, as for `cellpos run`.
+    #[arg(long, default_value = setup::DEFAULT_LAW)]
+    controller: String,
+    /// Rig file with the limits; default: the emulated rig. A camera that only the rig knows is taken to see -50um to 50um.
     #[arg(long)]
     rig: Option<PathBuf>,
     /// Smallest PZT displacement, instead of the rig's.
@@ -52,9 +57,10 @@ pub(crate) struct Args {
 pub(crate) fn run(args: Args) -> CommandResult {
     output::ready(&args.report)?;
     let script = Script::read(&args.script).map_err(Failure::input)?;
-    let model = Model::load(&args.model).map_err(Failure::input)?;
-    let (limits, knows_view) = limits(&args)?;
-    let result = check(&script, &model, &limits).map_err(Failure::input)?;
+    let plan = Plan::new(&script).map_err(Failure::input)?;
+    let (rig, prepared, knows_view) = rehearsed(&args)?;
+    let limits = replaced(possible::limits(&prepared, &rig), &args);
+    let result = possible::checked(&script, &plan, &prepared, &limits, rig.file())?;
     if let Some(path) = &args.report {
         report(&script, &result, &limits, &args)
             .write_with_figures(path)
@@ -78,28 +84,25 @@ pub(crate) fn run(args: Args) -> CommandResult {
     })
 }
 
-/// The limits of the rig, and the options that replace them; whether they hold what the camera sees, which a camera of its own tells
-/// only when it is asked.
-fn limits(args: &Args) -> Result<(CheckLimits, bool), Failure> {
-    let mut limits = CheckLimits::default();
-    let mut knows_view = args.view.is_some();
-    if let Some(path) = &args.rig {
-        let file = RigFile::load(Some(path))?;
-        let rig = setup::within(
-            file.limits,
-            [limits.low_um, limits.high_um, limits.slew_um_per_s],
-        );
-        limits.low_um = rig.low_um;
-        limits.high_um = rig.high_um;
-        limits.slew_um_per_s = rig.slew_um_per_s;
-        limits.neutral_um = file.first_neutral_um;
-        limits.sample_s = file.timing.period_us * 1e-6;
-        if file.is_emulated() {
-            let world = &file.emulator;
-            limits.view_um = 0.5 * f64::from(world.width_px) * world.pixel_um;
-            knows_view = true;
-        }
-    }
+/// The rehearsed rig of `cellpos run --dry`: it has the limits of the rig, with a controller fitted to it.
+/// The last value: whether the field of view is known without asking the camera.
+fn rehearsed(args: &Args) -> Result<(Rig, Prepared, bool), Failure> {
+    let mut file = RigFile::load(args.rig.as_deref())?;
+    let knows_view = args.view.is_some() || possible::knows_field(&file);
+    possible::rehearse(&mut file, &args.model);
+    let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
+    let options = Options {
+        clock: ClockKind::Virtual,
+        frames: Frames::Off,
+        best_effort: true,
+    };
+    let rig = Rig::open(file, options)?;
+    rig.fit(&mut prepared);
+    Ok((rig, prepared, knows_view))
+}
+
+/// Limits with the options that replace them.
+fn replaced(mut limits: CheckLimits, args: &Args) -> CheckLimits {
     let instead = |value: &mut f64, said: Option<f64>| {
         if let Some(said) = said {
             *value = said;
@@ -111,7 +114,7 @@ fn limits(args: &Args) -> Result<(CheckLimits, bool), Failure> {
     let slew = args.slew.map(MicrometersPerSecond::value);
     instead(&mut limits.slew_um_per_s, slew);
     instead(&mut limits.view_um, args.view.map(Micrometers::value));
-    Ok((limits, knows_view))
+    limits
 }
 
 /// Figures of a check as names and values.
@@ -386,7 +389,8 @@ fn report(script: &Script, check: &Check, limits: &CheckLimits, args: &Args) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cellpos_script::LimitUse;
+    use cellpos_plant::Model;
+    use cellpos_script::{LimitUse, check};
 
     /// No factor is promised that would break the limit.
     #[test]

@@ -4,6 +4,7 @@ mod following;
 pub(super) mod learning;
 mod load;
 mod over;
+pub(super) mod possible;
 mod queue;
 mod ready;
 pub(super) mod resume;
@@ -19,19 +20,17 @@ use crate::keys;
 use crate::notify::NotifyArgs;
 use crate::outcome::{CommandResult, Failure, Outcome, print_text};
 use crate::view_args::ViewArgs;
-use cellpos_emulator::{CellConfig, FaultKind};
+use cellpos_emulator::FaultKind;
 use cellpos_numeric::units::Micrometers;
 use cellpos_record::{InputFile, LineFile, RunWriter};
 use cellpos_runtime::EndRule;
-use cellpos_script::{
-    AmplitudeWatch, Check, CheckLimits, CycleRow, CycleTable, Plan, Script, check,
-};
+use cellpos_script::{AmplitudeWatch, CycleRow, CycleTable, Plan, Script};
 use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::live_line::Typed;
-use cellpos_session::rig_file::{ActuatorConfig, CameraConfig, ClockKind, Frames, RigFile};
+use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_session::sessions::SessionConfig;
-use cellpos_session::setup::{self, Prepared, Setup};
+use cellpos_session::setup::{self, Setup};
 use cellpos_session::view::{Page, Viewed};
 use cellpos_session::{Options, Rig, connect};
 use learning::Keeper;
@@ -159,7 +158,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     let mut file = RigFile::load(args.rig.as_deref())?;
     file.emulate_as(args.seed, args.ideal)?;
     if args.dry {
-        rehearse(&mut file, &args.model);
+        possible::rehearse(&mut file, &args.model);
     }
     for path in connect::inputs(args.rig.as_deref(), &file, &args.model, &args.controller) {
         inputs.push(InputFile::of(path).map_err(Failure::input)?);
@@ -197,72 +196,6 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     })
 }
 
-/// The emulated rig as the model says: everything of the rig file but its devices.
-fn rehearse(file: &mut RigFile, model: &str) {
-    file.actuator = match (file.actuator.period_ms(), file.actuator.lags_ms()) {
-        (Some(period_ms), [regulator_ms, compliance_ms]) => ActuatorConfig::EmulatedPressure {
-            period_ms,
-            regulator_ms,
-            compliance_ms,
-        },
-        (None, _) => ActuatorConfig::Emulated {},
-    };
-    file.camera = CameraConfig::Emulated {};
-    file.calibration = None;
-    file.emulator.model = model.to_string();
-    // A loop at the pace of a slow actuator takes the newest of several frames.
-    if file.actuator.period_ms().is_none() {
-        file.emulator.rate_hz = 1e6 / file.timing.period_us;
-    }
-    file.emulator.latency_ms = file.timing.camera_delay_ms;
-    if file.cell.is_some() && file.emulator.cell.is_none() {
-        file.emulator.cell = Some(CellConfig::default());
-        if file.emulator.validate().is_err() {
-            // A field that holds the cell at rest and stretched.
-            (file.emulator.width_px, file.emulator.height_px) = (256, 64);
-            file.emulator.pixel_um = 0.2;
-        }
-    }
-}
-
-/// The check of `cellpos check`, with the limits that are in force.
-fn allowed(script: &Script, setup: &Prepared, rig: &Rig) -> Result<Check, Failure> {
-    let (limits, file) = (setup.controller.limits, rig.file());
-    let [low_um, high_um] = rig.source().field_um;
-    let result = check(
-        script,
-        &setup.model,
-        &CheckLimits {
-            low_um: limits.low_um,
-            high_um: limits.high_um,
-            slew_um_per_s: limits.slew_um_per_s,
-            neutral_um: rig.first_zero_flow_um(&setup.model),
-            view_um: high_um.min(-low_um),
-            sample_s: file.timing.period_us * 1e-6,
-            ..CheckLimits::default()
-        },
-    )
-    .map_err(Failure::input)?;
-    if let Some(first) = result.violations.first() {
-        return Err(Failure::bad_input(
-            format!(
-                "{}:{}: {}: {:.3} {unit} asked for, {:.3} {unit} allowed: the rig cannot do it",
-                script.file,
-                first.line,
-                first.what,
-                first.asked,
-                first.allowed,
-                unit = first.unit
-            ),
-            format!(
-                "scale all positions by {:.3} or less; see cellpos check",
-                result.largest_factor
-            ),
-        ));
-    }
-    Ok(result)
-}
-
 /// What a run takes besides its plan, at most: arming, and the way to where the plan begins, s.
 const BEFORE_S: f64 = 30.0;
 
@@ -282,7 +215,6 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     let (script, plan) = reference.script()?.ok_or_else(|| {
         Failure::bad_input("the run has no script", "resume a run of cellpos run")
     })?;
-    measurable(&script, &plan, &file)?;
     let plan = Arc::new(plan);
     let options = Options {
         clock,
@@ -296,8 +228,7 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
     let path = args.rig.as_deref().filter(|_| !args.dry);
     let mut rig = checked::open(file, options, path, args.anyway)?;
     rig.fit(&mut prepared);
-    let checked = allowed(&script, &prepared, &rig)?;
-    following::below_nyquist(&script, &checked, rig.file())?;
+    possible::allowed(&script, &plan, &prepared, &rig)?;
     let mut warnings = match config.learn {
         // What is learned is not missed.
         true => Vec::new(),
@@ -375,20 +306,6 @@ fn page(name: &str, script: &Script) -> Page {
         script: true,
         notes: true,
     }
-}
-
-/// Waiting for a length needs a measured length.
-fn measurable(script: &Script, plan: &Plan, file: &RigFile) -> Result<(), Failure> {
-    if !plan.needs_length() || file.follows_a_cell() {
-        return Ok(());
-    }
-    Err(Failure::bad_input(
-        format!(
-            "{}: it waits for cell-length or stops on length_change_above, but the loop follows a bead and measures no length",
-            script.file
-        ),
-        "follow a cell: a table [cell] in rig.toml, or [emulator.cell] for the emulated rig",
-    ))
 }
 
 /// Where the records go.

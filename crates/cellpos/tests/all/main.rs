@@ -3,6 +3,7 @@
 mod arguments;
 mod bead_loss;
 mod cell;
+mod check;
 mod circle;
 mod common;
 mod design;

@@ -218,49 +218,6 @@ fn starts_of_the_cell(report: &Value) {
 }
 
 #[test]
-fn what_the_rig_cannot_do_is_refused_before_anything_moves() {
-    let folder = tempfile::tempdir().unwrap();
-    let text = "[[step]]\ndo = \"sine\"\namplitude = \"9um\"\nfrequency = \"200Hz\"\ncycles = 20\nramp_in = 4\nramp_out = 4\n";
-    std::fs::write(folder.path().join("wild.toml"), text).unwrap();
-    std::fs::write(folder.path().join("torn.toml"), "[[step]]\ndo = \"hodl\"\n").unwrap();
-    let (code, out, _) = cellpos(folder.path(), &["check", "wild.toml"]);
-    assert_eq!(code, Some(1));
-    assert!(
-        out.contains("wild.toml:1: PZT range") && out.contains("scale all positions by 0."),
-        "{out}"
-    );
-    // A rig with less room allows less, and what is said on the command line counts more.
-    let narrow = "first_neutral_um = 10.0\n[limits]\nlow_um = 0.0\nhigh_um = 20.0\nslew_um_per_s = 20000.0\npark_um = 10.0\n";
-    std::fs::write(folder.path().join("narrow.toml"), narrow).unwrap();
-    let largest = |extra: &[&str]| {
-        let args = [&["check", "wild.toml", "--json"], extra].concat();
-        let (_, out, _) = cellpos(folder.path(), &args);
-        let check: Value = serde_json::from_str(&out).unwrap();
-        check["waves"][0]["largest_um"].as_f64().unwrap()
-    };
-    let wide = largest(&["--slew", "1000000um/s"]);
-    let narrow = largest(&["--rig", "narrow.toml", "--slew", "1000000um/s"]);
-    assert!((narrow / wide - 0.5).abs() < 1e-6, "{narrow} {wide}");
-    let (code, _, err) = cellpos(folder.path(), &["run", "wild.toml", "--dry"]);
-    assert_eq!(code, Some(2));
-    assert!(err.contains("the rig cannot do it"), "{err}");
-    for args in [
-        ["check", "torn.toml"].as_slice(),
-        &["run", "torn.toml", "--dry"],
-    ] {
-        let (code, _, err) = cellpos(folder.path(), args);
-        assert_eq!(code, Some(2));
-        assert!(
-            err.contains("torn.toml:2:6") && err.contains("hold"),
-            "{err}"
-        );
-    }
-    let (code, _, err) = cellpos(folder.path(), &["run", "absent.toml"]);
-    assert_eq!(code, Some(2), "{err}");
-    assert!(!folder.path().join("runs").exists(), "nothing was started");
-}
-
-#[test]
 fn a_rehearsal_behaves_as_the_model_it_is_given() {
     let folder = tempfile::tempdir().unwrap();
     script(folder.path(), 60);

@@ -9,7 +9,8 @@ fn reader(kind: &str) -> Option<(&'static str, &'static str)> {
     Some(match kind {
         // Of a rig the devices are not there: the file alone is looked at.
         "rig" => ("rig.toml", "rig check rig.toml"),
-        "script" => ("script.toml", "check script.toml"),
+        // A script may wait for a cell's length.
+        "script" => ("script.toml", "check script.toml --rig cell.toml"),
         "model" => ("model.toml", "design --model model.toml --delay 2.5ms"),
         "calibration" => ("calibration.toml", "rig check uses-it.toml"),
         "controller" => (
@@ -31,6 +32,11 @@ fn try_snippet(kind: &str, text: &str) -> Result<(), String> {
     let uses_it =
         "calibration_file = \"calibration.toml\"\n[camera]\nkind = \"socket\"\nsocket = \"c\"\n";
     std::fs::write(folder.path().join("uses-it.toml"), uses_it).unwrap();
+    std::fs::copy(
+        root().join("examples/cell.toml"),
+        folder.path().join("cell.toml"),
+    )
+    .unwrap();
     let out = programs::cellpos(folder.path(), command).output().unwrap();
     let said = format!(
         "{}{}",
