@@ -7,7 +7,7 @@
 
 use nalgebra::Complex;
 
-use crate::sampled::{Hold, PartialFractions, Sampling};
+use crate::sampled::{Hold, PartialFractions, Sampled, Sampling};
 
 /// Parameters of Eq. (4) with real poles and zeros, and a delay.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -150,9 +150,9 @@ impl CandidateModel {
                 (direct * (1.0 - share), direct * share)
             });
         Sampler {
-            fractions,
-            delay_s: self.delay_s,
-            sampling,
+            smooth: fractions.sampled(self.delay_s, sampling),
+            row: (self.delay_s / sampling.period_s).round(),
+            period_s: sampling.period_s,
             late,
         }
     }
@@ -186,27 +186,25 @@ impl CandidateModel {
 /// A [`CandidateModel`] prepared for evaluation at many frequencies.
 #[derive(Debug, Clone)]
 pub struct Sampler {
-    fractions: PartialFractions,
-    delay_s: f64,
-    sampling: Sampling,
-    /// Feedthrough in the row nearest to the delay and in the one after it.
+    smooth: Sampled,
+    /// The row nearest to the delay.
+    row: f64,
+    period_s: f64,
+    /// Feedthrough in that row and in the one after it.
     late: Option<(f64, f64)>,
 }
 
 impl Sampler {
     /// What the record shows at `frequency_hz`.
     pub fn response(&self, frequency_hz: f64) -> Complex<f64> {
-        let smooth = self
-            .fractions
-            .sampled_response(frequency_hz, self.delay_s, self.sampling);
+        let smooth = self.smooth.response(frequency_hz);
         let Some((early, late)) = self.late else {
             return smooth;
         };
-        let angle = 2.0 * std::f64::consts::PI * frequency_hz * self.sampling.period_s;
-        let row = (self.delay_s / self.sampling.period_s).round();
+        let angle = 2.0 * std::f64::consts::PI * frequency_hz * self.period_s;
         smooth
-            + Complex::from_polar(early, -angle * row)
-            + Complex::from_polar(late, -angle * (row + 1.0))
+            + Complex::from_polar(early, -angle * self.row)
+            + Complex::from_polar(late, -angle * (self.row + 1.0))
     }
 }
 

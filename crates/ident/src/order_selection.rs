@@ -194,10 +194,10 @@ impl<'a> OrderSelection<'a> {
         let step = (100.0 / fastest.max(1e-9)).min(period_ms);
         let mut delay_ms = -2.0 * period_ms;
         while delay_ms <= 20.0 * period_ms {
-            let unit = CandidateModel::integrator(1.0, delay_ms * 1e-3).partial_fractions();
+            let unit = CandidateModel::integrator(1.0, delay_ms * 1e-3).sampler(self.sampling);
             let (mut cross, mut power) = (0.0, 0.0);
             for ((p, y), w) in self.points.iter().zip(data).zip(&self.weights) {
-                let h = unit.sampled_response(p.frequency_hz, delay_ms * 1e-3, self.sampling);
+                let h = unit.response(p.frequency_hz);
                 // Relative weights with a ceiling: the start must not depend on one very precise line.
                 let weight = (w * y.norm()).min(100.0) / y.norm();
                 cross += weight * weight * (y * h.conj()).re;

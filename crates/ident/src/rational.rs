@@ -153,10 +153,9 @@ pub(crate) fn fit_with(
     };
     let fill = |x: &[f64], out: &mut [f64]| {
         let (numerator, denominator, delay_s) = unscale(x);
-        let parts = fractions(&numerator, &denominator);
+        let sampled = fractions(&numerator, &denominator).sampled(delay_s, sampling);
         for (i, p) in points.iter().enumerate() {
-            let e = (p.response - parts.sampled_response(p.frequency_hz, delay_s, sampling))
-                * weights[i];
+            let e = (p.response - sampled.response(p.frequency_hz)) * weights[i];
             out[2 * i] = e.re;
             out[2 * i + 1] = e.im;
         }

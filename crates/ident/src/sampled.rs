@@ -91,28 +91,33 @@ impl PartialFractions {
         delay_s: f64,
         sampling: Sampling,
     ) -> Complex<f64> {
-        let w = 2.0 * std::f64::consts::PI * frequency_hz;
-        match sampling.hold {
-            Hold::None => {
-                let x = 0.5 * w * sampling.exposure_s;
-                let blur = if x.abs() < 1e-9 { 1.0 } else { x.sin() / x };
-                self.response(frequency_hz) * Complex::from_polar(blur, -w * delay_s)
-            }
-            Hold::ZeroOrder => self.held_response(w * sampling.period_s, delay_s, sampling),
+        self.sampled(delay_s, sampling).response(frequency_hz)
+    }
+
+    /// The same for many frequencies: what does not depend on the frequency is computed once.
+    pub fn sampled(&self, delay_s: f64, sampling: Sampling) -> Sampled {
+        let parts = match sampling.hold {
+            Hold::None => Vec::new(),
+            Hold::ZeroOrder => self.parts(delay_s, sampling),
+        };
+        Sampled {
+            plant: self.clone(),
+            delay_s,
+            sampling,
+            parts,
         }
     }
 
-    fn held_response(&self, angle: f64, delay_s: f64, sampling: Sampling) -> Complex<f64> {
+    fn parts(&self, delay_s: f64, sampling: Sampling) -> Vec<Part> {
         let period = sampling.period_s;
         let half = 0.5 * sampling.exposure_s;
         let (start, high) = ((delay_s - half) / period, (delay_s + half) / period);
         if high - start < 1e-6 {
             let n = whole_periods(delay_s / period);
             let m = (n + 1.0) * period - delay_s;
-            return Complex::from_polar(1.0, -angle * (n + 1.0))
-                * self.intersample(angle, period, |p| (p * m).exp(), |p| phi(p, m));
+            return vec![self.part(n + 1.0, 1.0, period, |p| (p * m).exp(), |p| phi(p, m))];
         }
-        let mut sum = Complex::from(0.0);
+        let mut parts = Vec::with_capacity(3);
         let mut low = start;
         while high - low > 1e-9 {
             let n = whole_periods(low);
@@ -120,32 +125,88 @@ impl PartialFractions {
             let (m0, m1) = ((n + 1.0 - end) * period, (n + 1.0 - low) * period);
             let share = (end - low) / (high - start);
             let mean = 1.0 / (m1 - m0);
-            let part = self.intersample(
-                angle,
+            parts.push(self.part(
+                n + 1.0,
+                share,
                 period,
                 |p| (phi(p, m1) - phi(p, m0)) * mean,
                 |p| (phi_integral(p, m1) - phi_integral(p, m0)) * mean,
-            );
-            sum += part * Complex::from_polar(share, -angle * (n + 1.0));
+            ));
             low = end;
         }
-        sum
+        parts
     }
 
-    /// The bracket of the module's equation, with `e^(p m)` and `phi(m)` or their means over an exposure.
-    fn intersample(
+    /// A part from `e^(p m)` and `phi(m)`, or their means over an exposure.
+    fn part(
         &self,
-        angle: f64,
+        rows: f64,
+        share: f64,
         period: f64,
         decay: impl Fn(Complex<f64>) -> Complex<f64>,
         growth: impl Fn(Complex<f64>) -> Complex<f64>,
-    ) -> Complex<f64> {
-        let z = Complex::from_polar(1.0, angle);
-        self.terms
-            .iter()
-            .fold(Complex::from(self.direct), |sum, &(p, r)| {
-                sum + r * (decay(p) * phi(p, period) / (z - (p * period).exp()) + growth(p))
+    ) -> Part {
+        let terms = (self.terms.iter())
+            .map(|&(p, residue)| HeldTerm {
+                residue,
+                step: decay(p) * phi(p, period),
+                pole: (p * period).exp(),
+                growth: growth(p),
             })
+            .collect();
+        Part { rows, share, terms }
+    }
+}
+
+/// A plant in records that were sampled in one way.
+#[derive(Debug, Clone)]
+pub struct Sampled {
+    plant: PartialFractions,
+    delay_s: f64,
+    sampling: Sampling,
+    /// Of a held input: the delays of an exposure that begin in one period are one part.
+    parts: Vec<Part>,
+}
+
+#[derive(Debug, Clone)]
+struct Part {
+    /// `n + 1` of the module's equation.
+    rows: f64,
+    /// Share of the exposure.
+    share: f64,
+    terms: Vec<HeldTerm>,
+}
+
+/// `r ( step / (z - pole) + growth )` of the module's equation.
+#[derive(Debug, Clone, Copy)]
+struct HeldTerm {
+    residue: Complex<f64>,
+    step: Complex<f64>,
+    pole: Complex<f64>,
+    growth: Complex<f64>,
+}
+
+impl Sampled {
+    /// The ratio of output to input at `frequency_hz`.
+    pub fn response(&self, frequency_hz: f64) -> Complex<f64> {
+        let w = 2.0 * std::f64::consts::PI * frequency_hz;
+        if self.sampling.hold == Hold::None {
+            let x = 0.5 * w * self.sampling.exposure_s;
+            let blur = if x.abs() < 1e-9 { 1.0 } else { x.sin() / x };
+            return self.plant.response(frequency_hz)
+                * Complex::from_polar(blur, -w * self.delay_s);
+        }
+        let angle = w * self.sampling.period_s;
+        let z = Complex::from_polar(1.0, angle);
+        let direct = Complex::from(self.plant.direct);
+        (self.parts.iter())
+            .map(|part| {
+                let bracket = (part.terms.iter()).fold(direct, |sum, t| {
+                    sum + t.residue * (t.step / (z - t.pole) + t.growth)
+                });
+                Complex::from_polar(part.share, -angle * part.rows) * bracket
+            })
+            .sum()
     }
 }
 

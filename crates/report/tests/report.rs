@@ -115,8 +115,8 @@ fn a_report_loads_nothing_and_runs_nothing() {
 }
 
 #[test]
-fn an_hour_at_one_kilohertz_stays_a_small_picture() {
-    let t: Vec<f64> = (0..3_600_000).map(|k| f64::from(k) / 1000.0).collect();
+fn a_quarter_of_an_hour_at_one_kilohertz_stays_a_small_picture() {
+    let t: Vec<f64> = (0..900_000).map(|k| f64::from(k) / 1000.0).collect();
     let y: Vec<f64> = t
         .iter()
         .map(|t| (t * 31.0).sin() + (t * 7777.0).cos())

@@ -78,7 +78,9 @@ fn compared(at: &Path, kind: &str, run: &Path) {
     let path = run.display();
     let ran = cellpos(
         at,
-        &format!("reconcile --model eq6 --data {path} --report {path}-gap.html --json"),
+        &format!(
+            "reconcile --model eq6 --data {path} --max-effects 1 --report {path}-gap.html --json"
+        ),
     );
     let said = ran.json();
     match ran.code {

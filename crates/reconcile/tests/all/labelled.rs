@@ -82,15 +82,24 @@ fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
 }
 
 #[test]
-#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
+#[ignore = "long: run with --release -- --include-ignored; that of a measured piezo is named in measured_piezo.rs"]
 fn hysteresis_of_the_piezo_is_named() {
     expect("pzt-hysteresis", &["pzt-hysteresis"]);
 }
 
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
-fn a_flow_drift_is_named() {
-    expect("flow-drift", &["flow-drift"]);
+fn a_flow_drift_is_named_however_the_records_are_ordered_and_cut() {
+    let first = expect("flow-drift", &["flow-drift"]);
+    let mut other = case("flow-drift");
+    other.reverse();
+    let cut = other.remove(1);
+    let middle = cut.rows() / 3;
+    other.insert(0, cut.part(middle, cut.rows()));
+    other.push(cut.part(0, middle));
+    let second = run(&other).unwrap();
+    assert_eq!(first.verdict, second.verdict);
+    assert_eq!(first.effects, second.effects);
 }
 
 #[test]
@@ -134,21 +143,6 @@ fn records_that_hide_nothing_get_no_name() {
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
 fn other_records_that_hide_nothing_get_no_name_either() {
     expect("none-2", &[]);
-}
-
-#[test]
-#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
-fn the_order_of_the_files_and_cutting_one_in_two_change_nothing() {
-    let records = case("flow-drift");
-    let first = run(&records).unwrap();
-    let mut other: Vec<Record> = records.iter().rev().cloned().collect();
-    let cut = other.remove(1);
-    let middle = cut.rows() / 3;
-    other.insert(0, cut.part(middle, cut.rows()));
-    other.push(cut.part(0, middle));
-    let second = run(&other).unwrap();
-    assert_eq!(first.verdict, second.verdict);
-    assert_eq!(first.effects, second.effects);
 }
 
 #[test]

@@ -1,9 +1,7 @@
 //! A rig in a closed loop whose zero flow moves: the command then holds what the flow did, and no effect may be made of it.
 
-use crate::closed_loop::{
-    DELAY_S, Flow, Hidden, WORKING_POINT_UM, closed_loop, run, run_from, survey, tones,
-};
-use cellpos_reconcile::{Options, Reconciliation, Verdict};
+use crate::closed_loop::{DELAY_S, Flow, Hidden, closed_loop, run, survey, tones};
+use cellpos_reconcile::{Reconciliation, Verdict};
 
 /// The names, of which the delay must be one, with its value.
 fn named(r: &Reconciliation) -> Vec<&str> {
@@ -19,14 +17,14 @@ fn named(r: &Reconciliation) -> Vec<&str> {
 
 #[test]
 fn a_zero_flow_that_moves_is_no_effect_of_the_response() {
-    let flows = [(0.006, 20.0, 0.001), (0.02, 5.0, 0.0), (0.002, 50.0, 0.005)];
+    let flows = [(0.02, 5.0, 0.0), (0.002, 50.0, 0.005)];
     for (seed, (wander_um, time_s, drift_um_per_s)) in flows.into_iter().enumerate() {
         let flow = Flow {
             wander_um,
             time_s,
             drift_um_per_s,
         };
-        let r = run(closed_loop(flow, Hidden::Nothing, tones, 40 + seed as u64));
+        let r = run(closed_loop(flow, Hidden::Nothing, tones, 41 + seed as u64));
         assert_eq!(named(&r), ["time-delay"], "{:?} {:?}", r.places, r.noise);
         assert_eq!(r.verdict, Verdict::Named, "{:?}", r.remainder);
         assert!(r.noise.zero_flow.is_some(), "{:?}", r.noise);
@@ -51,28 +49,22 @@ fn what_is_missing_is_named_beside_a_zero_flow_that_moves() {
 }
 
 #[test]
-fn a_leak_is_told_from_a_zero_flow_that_moves_wherever_the_bead_rests() {
+fn a_leak_is_told_from_a_zero_flow_that_moves() {
+    // Where the rest is not known before: closed_loop_table.rs.
     let flow = Flow {
         wander_um: 0.006,
         time_s: 20.0,
         drift_um_per_s: 0.001,
     };
     let record = closed_loop(flow, Hidden::Leak(2.0), survey, 71);
-    let unknown = Options {
-        free_working_point: true,
-        ..Options::default()
-    };
-    let known = Options::default();
-    for (off_um, options) in [(0.0, &known), (0.3, &unknown)] {
-        let r = run_from(record.clone(), WORKING_POINT_UM + off_um, options);
-        let mut names = named(&r);
-        names.sort_unstable();
-        assert_eq!(names, ["leak", "time-delay"], "{off_um}: {:?}", r.places);
-        let leak = r.effects.iter().find(|e| e.id == "leak").unwrap();
-        let p = &leak.parameters["corner_rad_per_s"];
-        let half = 0.5 * (p.ci95[1] - p.ci95[0]);
-        assert!(half < 0.4 && (p.value - 2.0).abs() < 1.5 * half, "{p:?}");
-    }
+    let r = run(record);
+    let mut names = named(&r);
+    names.sort_unstable();
+    assert_eq!(names, ["leak", "time-delay"], "{:?}", r.places);
+    let leak = r.effects.iter().find(|e| e.id == "leak").unwrap();
+    let p = &leak.parameters["corner_rad_per_s"];
+    let half = 0.5 * (p.ci95[1] - p.ci95[0]);
+    assert!(half < 0.4 && (p.value - 2.0).abs() < 1.5 * half, "{p:?}");
 }
 
 #[test]
