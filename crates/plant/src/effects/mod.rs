@@ -74,7 +74,7 @@ pub use parameter::{EffectError, Form, Parameter, ParameterSpec, Spec};
 pub use pdms_relaxation::{pdms_relaxation, pdms_relaxation_of_fast_gain};
 pub use pixel_locking::pixel_locking;
 pub use pump_pulsation::pump_pulsation;
-pub use pzt_creep::{pzt_creep, pzt_creep_from, pzt_creep_of_fast_gain};
+pub use pzt_creep::{pzt_creep, pzt_creep_from, pzt_creep_of_fast_gain, pzt_creep_of_lags_from};
 pub use pzt_hysteresis::{Curve, bouc_wen, bouc_wen_explicit, curved_play, exponential_play, play};
 pub use pzt_resonance::pzt_resonance;
 pub use saturation::saturation;
@@ -180,6 +180,12 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
     /// The candidate with the static curve of the effect but no memory, if any.
     fn memoryless(&self) -> Option<usize> {
         None
+    }
+
+    /// Other candidates with the numbers of this one, in equations that few records tell from its own.
+    fn shapes(&self, form: usize) -> &'static [usize] {
+        let _ = form;
+        &[]
     }
 
     /// Whether its simple forms differ so much that the second best may win together with other effects.

@@ -26,23 +26,35 @@ pub fn pzt_creep_from(per_decade: f64, onset_s: f64) -> Effect {
     Effect::new(&KIND, WITH_ONSET, &[per_decade, onset_s], &[])
 }
 
+/// Creep whose lags begin sharply at `onset_s`: the response has the factor `1 + g log10(1 + 1/(onset s))`, for a model with the gain
+/// before that.
+pub fn pzt_creep_of_lags_from(per_decade: f64, onset_s: f64) -> Effect {
+    Effect::new(&KIND, WITH_SHARP_ONSET, &[per_decade, onset_s], &[])
+}
+
 /// The model's gain is that of a step after 0.1 s.
 const AT_REST: usize = 0;
 /// The model's gain is that of a step after 1 ms.
 const AT_SPEED: usize = 1;
 /// Creep begins later than the model's fast motion.
 const WITH_ONSET: usize = 2;
+/// The same, no lag being shorter than the onset.
+const WITH_SHARP_ONSET: usize = 3;
 
 const PER_DECADE: ParameterSpec = ParameterSpec::new("per_decade", "", -0.2, 0.2);
 const ONSET: ParameterSpec = ParameterSpec::new("onset_s", "s", 1e-4, 100.0);
 
-const FORMS: [Form; 3] = {
+const FORMS: [Form; 4] = {
     let [slow, fast] = Form::anchored(&[PER_DECADE]);
     let onset = Form {
         name: "onset",
         ..Form::only(&[PER_DECADE, ONSET])
     };
-    [slow, fast, onset]
+    let sharp = Form {
+        name: "sharp-onset",
+        ..onset
+    };
+    [slow, fast, onset, sharp]
 };
 
 const PER_DECADE_FREE: super::FitParameter = lin("per_decade", 1e-5, 0.19, 1e-3);
@@ -59,7 +71,7 @@ static SPEC: Spec = Spec {
     id: "pzt-creep",
     place: Place::Pzt,
     shown_at: "",
-    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion; 1 + t/onset where creep begins later",
+    equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion; 1 + t/onset where creep begins later; 1 + g log10(1 + 1/(onset s)) where it has no shorter lag",
     signature: "a tail in the logarithm of time that flips with the sign of the step; a constant phase of about -39 g deg",
     ahead_of_plant: false,
     forms: &FORMS,
@@ -77,6 +89,7 @@ impl EffectKind for PztCreep {
     fn act(&self, effect: &Effect) -> Action {
         let since = match effect.form_index() {
             WITH_ONSET => Since::Onset(effect.scalar(1)),
+            WITH_SHARP_ONSET => Since::SharpOnset(effect.scalar(1)),
             AT_SPEED => Since::Always(FAST_REFERENCE_S),
             _ => Since::Always(CREEP_REFERENCE_S),
         };
@@ -87,8 +100,16 @@ impl EffectKind for PztCreep {
         true
     }
 
+    fn shapes(&self, form: usize) -> &'static [usize] {
+        match form {
+            WITH_ONSET => &[WITH_SHARP_ONSET],
+            WITH_SHARP_ONSET => &[WITH_ONSET],
+            _ => &[],
+        }
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: [Candidate; 3] = {
+        const ALL: [Candidate; 4] = {
             let [slow, fast] = FREE.anchored();
             // An onset below the shortest row gives the form before this one; an onset beyond the records gives no creep.
             let onset = Candidate {
@@ -96,14 +117,18 @@ impl EffectKind for PztCreep {
                 params: &[PER_DECADE_FREE, log("onset_s", 1e-3, 3.0)],
                 ..FREE
             };
-            [slow, fast, onset]
+            let sharp = Candidate {
+                name: "sharp-onset",
+                ..onset
+            };
+            [slow, fast, onset, sharp]
         };
         const { &ALL }
     }
 
     fn starts(&self, form: usize, _: &Scope) -> Vec<Vec<f64>> {
         match form {
-            WITH_ONSET => grid(&[0.03], &[0.01, 0.1]),
+            WITH_ONSET | WITH_SHARP_ONSET => grid(&[0.03], &[0.01, 0.1]),
             _ => one([0.01, 0.05]),
         }
     }
@@ -122,10 +147,12 @@ const CREEP_REFERENCE_S: f64 = 0.1;
 /// The same for the gain of fast motion.
 const FAST_REFERENCE_S: f64 = 1e-3;
 
-/// Time constants of the creep bank, s.
-fn creep_times() -> impl Iterator<Item = f64> {
+/// Time constants of the creep bank from the fastest on, s.
+fn creep_times(fastest_s: f64) -> impl Iterator<Item = f64> {
+    let slowest_s = CREEP_FASTEST_S * 10f64.powi(CREEP_DECADES as i32);
     (0..CREEP_DECADES * CREEP_PER_DECADE)
-        .map(|i| CREEP_FASTEST_S * 10f64.powf((i as f64 + 0.5) / CREEP_PER_DECADE as f64))
+        .map(move |i| fastest_s * 10f64.powf((i as f64 + 0.5) / CREEP_PER_DECADE as f64))
+        .take_while(move |tau| *tau < slowest_s)
 }
 
 /// Origin of the logarithm.
@@ -135,6 +162,8 @@ enum Since {
     Always(f64),
     /// A time after the step \[s\].
     Onset(f64),
+    /// The shortest lag \[s\].
+    SharpOnset(f64),
 }
 
 /// Lags whose share is below this part of the others' are left out: pole and zero would coincide.
@@ -147,9 +176,14 @@ fn creep(per_decade: f64, since: Since) -> Zpk {
         return Zpk::one();
     }
     let share = per_decade / CREEP_PER_DECADE as f64;
-    let lags: Vec<(f64, f64)> = creep_times()
+    // Lags in cells of equal ratio: those of a sharp onset begin there.
+    let first_s = match since {
+        Since::SharpOnset(onset_s) => onset_s,
+        _ => CREEP_FASTEST_S,
+    };
+    let lags: Vec<(f64, f64)> = creep_times(first_s)
         .map(|tau| match since {
-            Since::Always(_) => (1.0 / tau, share),
+            Since::Always(_) | Since::SharpOnset(_) => (1.0 / tau, share),
             Since::Onset(onset_s) => (1.0 / tau, share * (-onset_s / tau).exp()),
         })
         .filter(|(_, of_lag)| of_lag.abs() >= LEAST_SHARE * share.abs())
@@ -157,7 +191,7 @@ fn creep(per_decade: f64, since: Since) -> Zpk {
     let rates: Vec<f64> = lags.iter().map(|(rate, _)| *rate).collect();
     let before = |(rate, of_lag): &(f64, f64)| match since {
         Since::Always(reference_s) => of_lag * (-reference_s * rate).exp_m1(),
-        Since::Onset(_) => 0.0,
+        Since::Onset(_) | Since::SharpOnset(_) => 0.0,
     };
     let direct = 1.0 + lags.iter().map(before).sum::<f64>();
     let value = |s: f64| {

@@ -70,6 +70,15 @@ impl Variant {
         Some(Self { form, ..self })
     }
 
+    /// Other forms with the same numbers, in equations that few records tell from this one's.
+    pub(crate) fn shapes(self) -> impl Iterator<Item = Self> {
+        let shapes = self.kind.shapes(self.form).iter();
+        shapes.map(move |form| Self {
+            form: *form,
+            ..self
+        })
+    }
+
     /// How many simple forms of the effect are worth following beside a set: of forms that are limits of each other the best one.
     pub(crate) fn forms_worth_following(self) -> usize {
         1 + usize::from(self.kind.has_unlike_forms())

@@ -16,6 +16,7 @@ pub(crate) mod response;
 pub(crate) mod result;
 mod searching;
 mod sentences;
+mod shapes;
 mod significance;
 mod small;
 mod split;

@@ -10,6 +10,7 @@ use crate::verdict::form;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};
 use crate::verdict::profile;
 use crate::verdict::result::{Effect as NamedEffect, Interval};
+use crate::verdict::shapes;
 use crate::verdict::significance;
 use crate::verdict::split;
 use cellpos_plant::effects;
@@ -151,6 +152,7 @@ pub(crate) fn names(
             alternatives,
         });
     }
+    shapes::reach(ctx, fit, &sure.wide, &mut out.effects, threads);
     out
 }
 

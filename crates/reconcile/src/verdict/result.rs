@@ -65,6 +65,11 @@ impl Interval {
             high.max(value + (high - self.value)),
         ];
     }
+
+    /// Widens the interval to hold another.
+    pub(crate) fn cover(&mut self, [low, high]: [f64; 2]) {
+        self.ci95 = [self.ci95[0].min(low), self.ci95[1].max(high)];
+    }
 }
 
 /// One named effect.

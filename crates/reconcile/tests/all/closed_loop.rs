@@ -38,6 +38,12 @@ pub(super) enum Hidden {
     Relaxation(f64, f64),
     /// Part of a step that comes late, by eight exponentials of 10 ms to 30 s, per decade.
     Creep(f64),
+    /// The same with shares `exp(-onset/time)`: the logarithm of one and the time in onsets \[s\].
+    LateCreep(f64, f64),
+    /// Creep by a power of time; its share after a second, and the exponent.
+    PowerCreep(f64, f64),
+    /// Relaxation in three times a factor of four apart: strength, and the time of the middle one \[s\].
+    SpreadRelaxation(f64, f64),
     /// Speed below which the bead sticks \[um/s\].
     Adhesion(f64),
     /// Most speed of the amplifier \[um/s\].
@@ -77,6 +83,9 @@ impl Hidden {
                 vec![("strength", s / (1.0 - s)), ("time_s", time_s)],
             ),
             Self::Creep(per_decade) => ("pzt-creep", vec![("per_decade", per_decade)]),
+            Self::LateCreep(per_decade, _) => ("pzt-creep", vec![("per_decade", per_decade)]),
+            Self::PowerCreep(..) => ("pzt-creep", vec![]),
+            Self::SpreadRelaxation(..) => ("pdms-relaxation", vec![]),
             Self::Adhesion(v) => ("wall-adhesion", vec![("speed_um_per_s", v)]),
             Self::DeadZone(_) => ("wall-adhesion", vec![]),
             Self::Slew(rate) => ("slew-limit", vec![("rate_um_per_s", rate)]),
@@ -153,14 +162,25 @@ impl Chain {
             Hidden::Lag(hz) => lagged(&mut s[0], u, h * TAU * hz),
             Hidden::Resonance(hz, damping) => swung(s, u, TAU * hz, damping, h).0,
             Hidden::Relaxation(strength, time_s) => u - strength * lagged(&mut s[0], u, h / time_s),
-            Hidden::Creep(per_decade) => {
-                // Half a decade apart.
-                let mut x = u;
-                for (i, s) in s.iter_mut().enumerate() {
-                    let time_s = 0.01 * 10f64.powf(0.5 * i as f64);
-                    x += 0.5 * per_decade * lagged(s, u, h / time_s);
-                }
-                x
+            // Half a decade apart.
+            Hidden::Creep(per_decade) => u + lags(s, u, h, |_| 0.5 * per_decade),
+            Hidden::LateCreep(per_decade, onset_s) => {
+                u + lags(s, u, h, |time_s| {
+                    0.5 * per_decade * (-onset_s / time_s).exp()
+                })
+            }
+            Hidden::PowerCreep(share, power) => {
+                // The integral of `(1 - exp(-t/time)) time^power` over `ln time` is `gamma(1 - power)/power t^power`.
+                let gamma = 1.0 + 0.5772 * power + 0.989 * power * power;
+                let at_1_s = share * power / gamma * 0.5 * 10f64.ln();
+                u + lags(s, u, h, |time_s| at_1_s * time_s.powf(power))
+            }
+            Hidden::SpreadRelaxation(strength, time_s) => {
+                let parts = [(0.25, 0.25), (0.5, 1.0), (0.25, 4.0)];
+                let each = parts.iter().zip(s.iter_mut());
+                u - each
+                    .map(|((part, times), s)| strength * part * lagged(s, u, h / (time_s * times)))
+                    .sum::<f64>()
             }
             Hidden::Slew(rate) => {
                 // A ramp over a part of the step, then rest.
@@ -170,6 +190,16 @@ impl Chain {
             }
         }
     }
+}
+
+/// Mean over a step of eight lags from 10 ms on, half a decade apart, each with the share of its time.
+fn lags(state: &mut [f64; 8], u: f64, step_s: f64, share: impl Fn(f64) -> f64) -> f64 {
+    let times = (0..).map(|i| 0.01 * 10f64.powf(0.5 * f64::from(i)));
+    state
+        .iter_mut()
+        .zip(times)
+        .map(|(s, time_s)| share(time_s) * lagged(s, u, step_s / time_s))
+        .sum()
 }
 
 /// Mean output over a step of a lag whose rate times the step is `share`; `state` goes on to the end of the step.
