@@ -42,6 +42,7 @@ mod objects;
 mod observed;
 mod offsets;
 mod outline;
+mod overlap;
 mod pool;
 pub mod profile;
 mod range;

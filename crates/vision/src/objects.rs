@@ -32,12 +32,26 @@ pub(crate) struct Object {
     pub y_px: f64,
     pub radius_px: f64,
     pub contrast: f64,
+    /// Whether the border cuts it: its place is only about right, and nothing is learnt from it.
+    pub cut: bool,
+}
+
+/// A pixel of a bead.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OfBead {
+    pub x_px: f64,
+    pub y_px: f64,
+    /// Distance from the bead, px.
+    pub r_px: f64,
+    pub grey: f64,
 }
 
 /// An object that a profile is learnt from.
 #[derive(Debug, Clone)]
 pub(crate) struct Bead {
     pub at: Object,
+    /// Contrast of its image, in those of the others.
+    pub contrast: f64,
     /// Places of the objects about it, px.
     others: Vec<(f64, f64)>,
 }
@@ -54,17 +68,17 @@ impl Bead {
         };
         Bead {
             at: *at,
+            contrast: 1.0,
             others: all[first..end].iter().filter(near).map(place).collect(),
         }
     }
 
-    /// Distances from its place of the pixels up to `reach_px` along row and column, px, and their grey values. Pixels that are
-    /// nearer to another object are not among them.
+    /// The pixels up to `reach_px` along row and column. Those that are nearer to another object are not among them.
     pub(crate) fn pixels<'a>(
         &'a self,
         flats: &'a [Flat],
         reach_px: f64,
-    ) -> Option<impl Iterator<Item = (f64, f64)> + 'a> {
+    ) -> Option<impl Iterator<Item = OfBead> + 'a> {
         let flat = flats.get(self.at.frame)?;
         let (x_px, y_px) = (self.at.x_px, self.at.y_px);
         let (x0, x1) = crate::template::span(x_px, reach_px, flat.width);
@@ -75,7 +89,12 @@ impl Bead {
             let off_px2 = squared(u - x_px, v - y_px);
             let nearest = |(a, b): &(f64, f64)| squared(u - a, v - b) >= off_px2;
             let own = self.others.iter().all(nearest);
-            own.then(|| (off_px2.sqrt(), f64::from(flat.values[y * flat.width + x])))
+            own.then(|| OfBead {
+                x_px: u,
+                y_px: v,
+                r_px: off_px2.sqrt(),
+                grey: f64::from(flat.values[y * flat.width + x]),
+            })
         }))
     }
 }
@@ -186,10 +205,7 @@ impl Flat {
         };
         let found = blobs.label((self.width, self.height), threshold, 20.0, row);
         for blob in found {
-            if blob.at_border {
-                refused.at_border += 1;
-                continue;
-            }
+            refused.at_border += usize::from(blob.at_border);
             // The mean over 5 x 5 pixels has made it wider by two pixels all round.
             let radius_px = ((blob.area_px / core::f64::consts::PI).sqrt() - 2.0).max(1.5);
             let side = (2.0 * 1.2 * radius_px).ceil() as usize | 1;
@@ -198,8 +214,10 @@ impl Flat {
                 0.5 * (f64::from(left) + f64::from(right) - 1.0),
                 0.5 * (f64::from(top) + f64::from(bottom) - 1.0),
             );
-            let (x_px, y_px) = self
-                .centre(middle, side.clamp(7, MAX_WINDOW_PX))
+            let whole = !blob.at_border;
+            let (x_px, y_px) = whole
+                .then(|| self.centre(middle, side.clamp(7, MAX_WINDOW_PX)))
+                .flatten()
                 .unwrap_or(middle);
             objects.push(Object {
                 frame,
@@ -207,6 +225,7 @@ impl Flat {
                 y_px,
                 radius_px,
                 contrast: blob.peak,
+                cut: blob.at_border,
             });
         }
     }

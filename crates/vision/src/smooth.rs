@@ -9,17 +9,17 @@
 use crate::profile::{GaussianProfile, RadialProfile, RingProfile};
 
 /// Bins of the distance: a hundredth of a small bead's radius, so that the profile is level within one.
-const BINS: usize = 512;
+pub(crate) const BINS: usize = 512;
 /// Most knots of the deviation.
 const MOST_KNOTS: usize = 32;
 /// Least distance of the knots, px: a picture without aliasing shows no period under two pixels, and a cubic spline follows
 /// a period with three knots.
 const LEAST_KNOT_PX: f64 = 0.7;
 /// Penalties tried: a factor of two from one to the next. The largest leaves a constant.
-const PENALTIES: i32 = 40;
+pub(crate) const PENALTIES: i32 = 40;
 /// Least gain in predicting the other half, in variances of the noise: with a true parametric profile the best of all
 /// penalties gains so much less often than once in 100 draws (`chance_confirms_no_deviation`).
-const LEAST_GAIN: f64 = 10.0;
+pub(crate) const LEAST_GAIN: f64 = 10.0;
 
 /// Grey values by their distance from the centre, with weights, in the two halves of the beads.
 #[derive(Debug, Clone)]
@@ -56,13 +56,23 @@ impl Half {
 #[derive(Debug, Clone)]
 pub(crate) struct Learnt {
     /// Values at the middles of the bins, in the units of what was collected.
-    at: [f64; BINS],
-    bin_px: f64,
+    pub at: [f64; BINS],
+    pub bin_px: f64,
     /// Whether the beads have confirmed a deviation from the parametric profile.
     pub deviates: bool,
 }
 
 impl Learnt {
+    /// A parametric profile alone.
+    pub(crate) fn of(parametric: Parametric, reach_px: f64) -> Option<Self> {
+        let bin_px = reach_px / BINS as f64;
+        Some(Learnt {
+            at: parametric.at(bin_px)?,
+            bin_px,
+            deviates: false,
+        })
+    }
+
     /// Value at a distance; beyond the last bin its value.
     pub(crate) fn value(&self, r_px: f64) -> f64 {
         let u = (r_px / self.bin_px - 0.5).clamp(0.0, (BINS - 1) as f64);
@@ -167,19 +177,15 @@ impl Rings {
         found.1.is_finite().then_some(found.0)
     }
 
-    /// The profile: a parametric one with free contrast and level, plus the deviation that the halves confirm in each other.
-    pub(crate) fn learn_from(&self, parametric: Parametric) -> Option<Learnt> {
-        Some(self.learn(&parametric.at(self.bin_px())?))
-    }
-
-    /// The same from any function of the distance.
+    /// The profile: a given function of the distance with free contrast and level, plus the deviation that the halves confirm in
+    /// each other.
     pub(crate) fn learn_beyond(&self, prior: impl Fn(f64) -> f64) -> Learnt {
         let bin_px = self.bin_px();
         self.learn(&core::array::from_fn(|k| prior((k as f64 + 0.5) * bin_px)))
     }
 
     fn learn(&self, prior: &[f64; BINS]) -> Learnt {
-        let knots = ((self.reach_px / LEAST_KNOT_PX) as usize).clamp(6, MOST_KNOTS);
+        let knots = knots(self.reach_px);
         let priors = [self.scaled(prior, &[0]), self.scaled(prior, &[1])];
         let system = |half: usize, of: usize| System::new(self, &priors[of], &[half], knots);
         // Each half by its own prior, and by the other's.
@@ -356,15 +362,20 @@ impl System {
     }
 }
 
+/// Knots of a deviation up to a distance.
+pub(crate) fn knots(reach_px: f64) -> usize {
+    ((reach_px / LEAST_KNOT_PX) as usize).clamp(6, MOST_KNOTS)
+}
+
 /// Coefficient `k` of a spline that is even at both ends.
-fn mirrored(k: isize, knots: usize) -> usize {
+pub(crate) fn mirrored(k: isize, knots: usize) -> usize {
     let last = knots as isize - 1;
     let k = k.abs();
     (if k > last { 2 * last - k } else { k }).max(0) as usize
 }
 
 /// The four coefficients that a bin's middle depends on, and how strongly: a cubic B-spline.
-fn basis(bin: usize, knots: usize) -> [(usize, f64); 4] {
+pub(crate) fn basis(bin: usize, knots: usize) -> [(usize, f64); 4] {
     let u = (bin as f64 + 0.5) / BINS as f64 * (knots - 1) as f64;
     let k = (u as usize).min(knots - 2);
     let t = u - k as f64;
@@ -427,7 +438,7 @@ mod tests {
             .filter(|_| {
                 let rings = collected(10, 8.0, 0.15, &mut random, gaussian);
                 let prior = rings.parametric().unwrap();
-                rings.learn_from(prior).unwrap().deviates
+                rings.learn(&prior.at(rings.bin_px()).unwrap()).deviates
             })
             .count();
         assert!(confirmed <= 4, "{confirmed} of {draws}");
@@ -452,7 +463,7 @@ mod tests {
         let disc =
             |r: f64| 1.0 / (1.0 + ((r - 5.0) / 0.7).exp()) + 0.15 * (-(r - 8.0).powi(2)).exp();
         let rings = collected(20, 14.0, 0.1, &mut random, disc);
-        let learnt = rings.learn_from(rings.parametric().unwrap()).unwrap();
+        let learnt = rings.learn(&rings.parametric().unwrap().at(rings.bin_px()).unwrap());
         assert!(learnt.deviates);
         let off = (0..120)
             .map(|k| 0.1 + 0.1 * f64::from(k))

@@ -5,10 +5,11 @@
 //! becomes the template: aligned, fitted, aligned again. Offline; allocates.
 
 use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
-use crate::fix::FixQuality;
+use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::objects::{Bead, Flat, Object, Refused};
+use crate::overlap;
 use crate::range::Range;
 use crate::reach;
 use crate::smooth::{Learnt, Parametric, Rings};
@@ -99,7 +100,8 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
         flat.objects(n, &mut objects, &mut refused);
     }
     let all = objects.clone();
-    let seen = objects.len() + refused.at_border;
+    let seen = all.len();
+    objects.retain(|o| !o.cut);
     let count = frames.len();
     if objects.is_empty() {
         return Err(NothingToSuggest::Nothing { frames: count });
@@ -141,16 +143,19 @@ pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, Nothing
     let radius_px = 1.85 * rough.template().radius_px();
     let mut objects = Vec::new();
     for (n, frame) in frames.iter().enumerate() {
-        for blob in detector.detect(frame).iter().filter(|b| !b.at_border) {
+        for blob in detector.detect(frame) {
             objects.push(Object {
                 frame: n,
                 x_px: blob.x_px,
                 y_px: blob.y_px,
                 radius_px,
                 contrast: blob.peak,
+                cut: blob.at_border,
             });
         }
     }
+    let all = objects.clone();
+    objects.retain(|o| !o.cut);
     if objects.is_empty() {
         return Err(NothingToSuggest::Nothing {
             frames: frames.len(),
@@ -162,7 +167,7 @@ pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, Nothing
         other: seen - alike.len(),
         ..Refused::default()
     };
-    let suggestion = learn(frames, &flats, (alike, &objects), refused)?;
+    let suggestion = learn(frames, &flats, (alike, &all), refused)?;
     Ok(Suggestion {
         objects: seen,
         ..suggestion
@@ -176,7 +181,8 @@ fn learn(
     mut refused: Refused,
 ) -> Result<Suggestion, NothingToSuggest> {
     let region_px = median(alike.iter().map(|o| o.radius_px));
-    let mut reach_px = REACH.0 * region_px;
+    let least_px = REACH.0 * region_px;
+    let mut reach_px = least_px;
     let end_px = (REACH.1 * region_px).min(0.5 * MAX_WINDOW_PX as f64);
     let beads = alike.iter().map(|o| Bead::among(o, all, end_px));
     let mut beads: Vec<Bead> = beads.collect();
@@ -185,36 +191,22 @@ fn learn(
     let failed = NothingToSuggest::NoProfile { objects };
     let mut config = None;
     let mut template: Option<Template> = None;
-    let mut fits = Vec::new();
+    let mut fits: Vec<(usize, Fix)> = Vec::new();
     let mut filled = 1.0_f64;
     for pass in 0..PASSES {
-        if let Some(template) = &template {
-            let with_contrast = |bead| {
-                let pixels = Bead::pixels(bead, flats, reach_px)?;
-                Some((bead, contrast_and_level(template, pixels)?.0))
-            };
-            let seen = beads.iter().filter_map(with_contrast);
-            let extent_px = reach::of_beads(flats, seen, end_px as usize, snr);
-            reach_px = reach_px.max(extent_px / (1.0 - FADE));
-        }
-        let rings = collect(flats, &beads, template.as_ref(), reach_px);
+        let rings = collect(flats, &beads, template.as_ref(), least_px);
         let parametric = rings.parametric().ok_or(failed)?;
-        let learnt = rings.learn_from(parametric).ok_or(failed)?;
+        if pass > 0 {
+            let learnt = overlap::learn(flats, &beads, parametric, end_px).ok_or(failed)?;
+            let extreme = learnt.at.iter().fold(0.0, |best: f64, v| best.max(v.abs()));
+            let extent_px = reach::extent_px(|r_px| learnt.value(r_px) / extreme, end_px, snr);
+            reach_px = (extent_px / (1.0 - FADE)).clamp(least_px, end_px);
+        }
+        let learnt = overlap::learn(flats, &beads, parametric, reach_px).ok_or(failed)?;
         let mut settings = settings(&learnt, parametric, reach_px, snr).ok_or(failed)?;
         settings.template_tolerance = MOST_TOLERANCE;
         let mut localiser = Localiser::new(settings.clone()).map_err(|_| failed)?;
-        fits.clear();
-        for bead in beads.iter_mut().map(|bead| &mut bead.at) {
-            let Some(frame) = frames.get(bead.frame) else {
-                continue;
-            };
-            let fix = localiser.locate(frame, Some((bead.x_px, bead.y_px)));
-            let near = f64::hypot(fix.x_px - bead.x_px, fix.y_px - bead.y_px);
-            if fix.verdict == FixQuality::Good && near < localiser.template().radius_px() {
-                (bead.x_px, bead.y_px) = (fix.x_px, fix.y_px);
-                fits.push((bead.frame, fix));
-            }
-        }
+        fits = fit(frames, &mut beads, &mut localiser);
         template = settings.template().ok();
         snr = median(fits.iter().map(|(_, f)| f.snr));
         filled = localiser.filled();
@@ -248,6 +240,43 @@ fn learn(
     })
 }
 
+/// Fits the beads, each with the others of its frame; takes over their places and contrasts. The good fixes, with their frames.
+fn fit(frames: &[Frame], beads: &mut [Bead], localiser: &mut Localiser) -> Vec<(usize, Fix)> {
+    let mut fits = Vec::new();
+    let mut found: Vec<Fix> = Vec::new();
+    let near_px = localiser.template().radius_px();
+    beads.iter_mut().for_each(|bead| bead.contrast = 0.0);
+    for beads in beads.chunk_by_mut(|a, b| a.at.frame == b.at.frame) {
+        let Some(frame) = beads.first().and_then(|bead| frames.get(bead.at.frame)) else {
+            continue;
+        };
+        let places = beads.iter().map(|bead| (bead.at.x_px, bead.at.y_px));
+        localiser.locate_all(frame, places, &mut found);
+        for bead in beads {
+            let at = &mut bead.at;
+            let away = |fix: &Fix| f64::hypot(fix.x_px - at.x_px, fix.y_px - at.y_px);
+            let nearest = found.iter().min_by(|a, b| away(a).total_cmp(&away(b)));
+            let is_bead = |fix: &&Fix| fix.verdict == FixQuality::Good && away(fix) < near_px;
+            let Some(fix) = nearest.filter(is_bead) else {
+                continue;
+            };
+            (at.x_px, at.y_px) = (fix.x_px, fix.y_px);
+            bead.contrast = fix.amplitude.abs();
+            fits.push((at.frame, *fix));
+        }
+    }
+    // Of what has no good fix the contrast is that of most.
+    let usual = if fits.is_empty() {
+        1.0
+    } else {
+        median(fits.iter().map(|(_, fix)| fix.amplitude.abs()))
+    };
+    for bead in beads.iter_mut().filter(|bead| bead.contrast == 0.0) {
+        bead.contrast = usual;
+    }
+    fits
+}
+
 /// Objects alike to the one that has most, and strongest, like it.
 fn commonest(objects: &[Object]) -> Vec<Object> {
     let within = |a: f64, b: f64, factor: f64| a < factor * b && b < factor * a;
@@ -277,7 +306,7 @@ fn collect(
         let Some(pixels) = bead.pixels(flats, reach_px) else {
             continue;
         };
-        let pixels: Vec<(f64, f64)> = pixels.collect();
+        let pixels: Vec<(f64, f64)> = pixels.map(|p| (p.r_px, p.grey)).collect();
         let (contrast, level) = template
             .and_then(|template| contrast_and_level(template, pixels.iter().copied()))
             .unwrap_or((1.0, 0.0));
