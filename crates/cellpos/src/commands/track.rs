@@ -463,7 +463,7 @@ fn text(report: &Report) -> String {
     line(
         "frames",
         format!(
-            "{} lost, {} stale, {} without the bead, {} ticks coasted, bead re-acquired {} times",
+            "{} lost, {} stale, {} without a position, {} ticks coasted, bead re-acquired {} times",
             c.frames_lost, c.stale, c.fixes_lost, c.coasted, c.reacquired
         ),
     );

@@ -18,6 +18,7 @@ mod spectrum;
 mod spread;
 mod ticks;
 mod traces;
+mod unused;
 
 use cellpos_record::{RunEnd, RunReader};
 use cellpos_report::{Column, Emphasis, Report, Table};

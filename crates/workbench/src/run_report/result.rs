@@ -30,10 +30,7 @@ pub(super) fn section(
     let (status, ended) = ending(sessions);
     let kept = ended.is_none();
     let what = origin::subject(sessions.iter().find_map(|session| session.meta.as_ref()));
-    let (lost, without) = (
-        counted(sessions, "frames_lost"),
-        counted(sessions, "fixes_lost"),
-    );
+    let lost = counted(sessions, "frames_lost");
     let Said {
         mut result,
         mut sure,
@@ -64,9 +61,7 @@ pub(super) fn section(
         1 => " One frame is missing.".to_string(),
         many => format!(" {many} frames are missing."),
     });
-    if without > 0 {
-        result.push_str(&format!(" {without} frames showed no {what}."));
-    }
+    result.push_str(&ticks.unused.sentence(what));
     page.result(status, &result);
     page.certainty(&sure);
     result

@@ -5,6 +5,7 @@ use super::cycles::half95;
 use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::{Decades, Spread};
+use super::unused::Unused;
 use cellpos_runtime::{Hold, Statistics, TickRecord};
 use std::collections::VecDeque;
 
@@ -75,6 +76,8 @@ pub(super) struct Ticks {
     session: u64,
     pub wake_us: Decades,
     pub compute_us: Decades,
+    /// Frames that gave no position.
+    pub unused: Unused,
     /// From the middle of an exposure to the command computed from it, ms.
     age_ms: Spread,
     newest_frame: u64,
@@ -123,6 +126,7 @@ impl Ticks {
         self.has_partner |= partner[0].is_finite();
         self.partner.add(time_s, partner);
         self.rows += 1;
+        self.unused.add(r);
         self.end_s = time_s;
         self.wake_us.add(f64::from(r.wake_ns) * 1e-3);
         self.compute_us.add(f64::from(r.compute_ns) * 1e-3);

@@ -141,7 +141,7 @@ impl<'a> Report<'a> {
         line(
             "frames",
             format!(
-                "{} lost, {} stale, {} without a bead, {} ticks coasted",
+                "{} lost, {} stale, {} without a position, {} ticks coasted",
                 c.frames_lost, c.stale, c.fixes_lost, c.coasted
             ),
         );
