@@ -21,7 +21,7 @@ pub struct LoopState<S> {
     pub law: S,
     /// Command of the previous tick, um.
     pub previous_um: f64,
-    /// Part of it that was learned and that the estimator was not told of, um.
+    /// Learned part of it, which the estimator does not see, um.
     pub hidden_um: f64,
     /// Feed-forward of the previous tick, um from neutral in the units of the law.
     pub forward_um: f64,
@@ -29,7 +29,7 @@ pub struct LoopState<S> {
     pub path: PathState,
     /// Estimate of the plant and the tuning in force, where the loop adapts.
     pub adapt: Option<AdaptState>,
-    /// Gain over the model's that the feed-forward is divided by, where the loop does not adapt and it was measured before.
+    /// Gain over the model's that divides the feed-forward, if the loop does not adapt and the gain was measured before.
     pub measured_gain: Option<f64>,
 }
 
@@ -99,7 +99,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         &self.estimator
     }
 
-    /// A state at rest at a command, with a first belief of neutral (both um); one that no actuator reaches is none, and the command's.
+    /// A state at rest at a command, with a first value of neutral (both um). If no actuator reaches that neutral, it is the command.
     pub fn start(&self, command_um: f64, neutral_um: f64) -> LoopState<L::State> {
         let command = self.parts.limits.nearest(command_um);
         let neutral = if neutral_um.abs() <= FAR_UM {
@@ -176,8 +176,8 @@ impl<L: ControlLaw> ControlLoop<L> {
         }
     }
 
-    /// After the command of a tick: what it and the fix tell of the plant. A tuning that moved takes the states of estimator
-    /// and law with it, so that the position believed and the command go on where they were.
+    /// Updates the estimate of the plant after the command of a tick. If the tuning changes, the states of estimator and law change with
+    /// it, so that estimated position and command stay continuous.
     fn adapt(&self, state: &mut LoopState<L::State>, told: &TickOutcome) {
         let (before, from) = (self.tuning(state), self.estimator_of(state));
         let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) else {
@@ -307,8 +307,8 @@ impl<L: ControlLaw> ControlLoop<L> {
         output
     }
 
-    /// The zero flow has moved by a known amount. What matters to the plant is how far the PZT was from it at each time: the past commands
-    /// move along. The command itself does not: the slew limit counts from where the PZT stands.
+    /// Takes in a known move of the zero flow. The plant depends on the distance of the PZT from it at each time, so the past commands shift
+    /// along. The command itself does not: the slew limit counts from the PZT's displacement.
     fn shift(&self, state: &mut LoopState<L::State>, by_um: f64) {
         if by_um == 0.0 || !by_um.is_finite() {
             return;
@@ -320,7 +320,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         self.parts.controller.shift(&mut state.law, scaled_um);
     }
 
-    /// What is known to have stood at the actuator takes the place of the commands that did not reach it. Gives it, um.
+    /// Replaces the commands that did not reach the actuator by the displacement that it had. Returns it, um.
     fn take_in_force(&self, state: &mut LoopState<L::State>, input: &LoopInput) -> Option<f64> {
         let stood = input
             .in_force
@@ -336,8 +336,8 @@ impl<L: ControlLaw> ControlLoop<L> {
         Some(stood.displacement_um)
     }
 
-    /// A tick that never came: the command was held and the bead moved on. The estimator follows; integrator and
-    /// feed-forward stay where they are, so that a step in progress goes on as it was.
+    /// A skipped tick: the command was held and the bead moved on. The estimator follows. Integrator and feed-forward are kept, so that a
+    /// step in progress continues.
     pub fn skip(&self, state: &mut LoopState<L::State>) {
         self.estimator_of(state).step(&mut state.estimator, None);
         // What the estimator was told of the command; a learned part of it is held as well.
@@ -349,9 +349,9 @@ impl<L: ControlLaw> ControlLoop<L> {
         }
     }
 
-    /// The PZT is brought to a zero flow that is not the newest estimate: what was learnt since is not believed, and the bead is
-    /// expected where it was seen last. Without that it would be expected as far away as the wrong zero flow says, and the command
-    /// would jump when it is seen again. um of PZT, and its variance, um^2.
+    /// Returns to an earlier zero flow (um of PZT, and its variance, um^2) and discards the estimate since then. The bead is expected at its
+    /// last seen position. Otherwise the wrong zero flow would carry the prediction away, and the command would jump when the bead is
+    /// seen again.
     pub fn rest_at(&self, state: &mut LoopState<L::State>, zero_flow_um: f64, variance_um2: f64) {
         if zero_flow_um.is_finite() && variance_um2 >= 0.0 {
             let gain = self.tuning(state).gain;
@@ -434,7 +434,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         }
     }
 
-    /// The limits and the account of the tick.
+    /// Applies the limits and fills in the output of the tick.
     fn limit(
         &self,
         state: &LoopState<L::State>,
@@ -483,7 +483,7 @@ impl<L: ControlLaw> ControlLoop<L> {
     }
 }
 
-/// What moves the bead along the reference in a tick.
+/// The command that moves the bead along the reference in a tick.
 fn driven(input: &LoopInput, tick: &Tick, measured_gain: Option<f64>) -> Driven {
     let gain = tick.law.tuning.gain;
     let asked = input.feed_forward_gain;

@@ -26,7 +26,7 @@ const PAST: usize = 24;
 pub(crate) struct Past {
     /// At this tick and those before, newest first, um.
     positions_um: [f64; PAST],
-    /// Sum of all jumps up to each of them, um.
+    /// Sum of all jumps up to each position, um.
     jumped_um: [f64; PAST],
 }
 
@@ -61,7 +61,7 @@ impl Past {
         Some((1.0 - part) * at(newer)? + part * at(newer + 1)?)
     }
 
-    /// What a frame shows whose exposure of `exposure` ticks has its middle `age` ticks ago, um; `None` if that is longer ago than is kept.
+    /// Mean over an exposure of `exposure` ticks with its middle `age` ticks ago, um; `None` if the positions are no longer kept.
     pub(crate) fn seen(&self, age: f64, exposure: f64) -> Option<f64> {
         mean(age, exposure, |ago| self.at(ago))
     }

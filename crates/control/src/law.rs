@@ -1,9 +1,8 @@
-//! What a control law is: configuration that does not change, a state beside it, and a step from one tick to the next.
+//! Control laws: a constant configuration, a separate state, and a step from one tick to the next.
 //!
-//! A law decides where the PZT is to be. Everything around it is the loop's ([`crate::ControlLoop`]): it estimates, and
-//! after the law it adds what moves the plant along the reference, excitation and what was learned over cycles, keeps the command
-//! finite, within range and within slew, and tells the law what came of it. So a law of another crate is a configuration, a state and
-//! one method:
+//! A law computes the displacement of the PZT. The loop ([`crate::ControlLoop`]) does the rest. Before the law it estimates. After the law
+//! it adds feed-forward, excitation and learned corrections, limits the command to range and slew, and reports the applied command to
+//! the law. A law of another crate is a configuration, a state and one method:
 //!
 //! ```
 //! use cellpos_control::*;
@@ -48,28 +47,27 @@ use crate::feedforward::FeedForwardState;
 use crate::tuning::Tuning;
 use std::fmt::Debug;
 
-/// Columns of its own that a law may have in the record.
+/// Largest number of a law's columns in the record.
 pub const LAW_COLUMNS: usize = 8;
 
-/// What a law is given in a tick.
+/// Input of a law in a tick.
 #[derive(Debug, Clone, Copy)]
 pub struct LawInput<'a> {
     /// Where the bead is to be now, um; finite: the reference as far as range and slew let the plant follow it.
     pub reference_um: f64,
     /// References of the coming ticks, the next one first; see [`LawInput::preview`].
     pub preview_um: &'a [f64],
-    /// Position that this tick's measurement shows: the fix itself where it was used, else what the model says that it
-    /// would be, um. It is of the time of the frame, so older than the tick by the delay, but for the motion along the reference
-    /// since then, which is added.
+    /// Measured position, um: the fix if it was used, otherwise the model's prediction of it. It belongs to the time of the frame, which is
+    /// older than the tick by the delay; only the motion along the reference since then is added.
     pub bead_um: f64,
-    /// How far the feed-forward has moved the reference since the law took over, um: no error comes of that. The rest of the reference's
-    /// motion are jumps that were not known in advance.
+    /// Distance by which the feed-forward has moved the reference since the law took over, um: it causes no error. The rest of the
+    /// reference's motion consists of jumps that were not known in advance.
     pub fed_um: f64,
     /// The model on the reference before this tick's command.
     pub on_path: FeedForwardState,
     /// What the loop adds to the wish in this tick to move the model along the reference, um.
     pub feed_forward_um: f64,
-    /// What the estimator knows.
+    /// The estimate.
     pub estimate: Estimate,
     /// Command in force before this tick, less what was learned and the model does not know, um.
     pub previous_um: f64,
@@ -104,12 +102,12 @@ impl LawInput<'_> {
     }
 }
 
-/// What a law answers.
+/// Output of a law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LawOutput {
     /// Where the PZT is to be, um, less what moves it along the reference. The loop adds that, and keeps the sum within the limits.
     pub wish_um: f64,
-    /// Account of an optimiser.
+    /// Status and cost of an optimiser.
     pub solver: SolverReport,
 }
 
@@ -126,10 +124,10 @@ impl LawOutput {
 /// A control law: immutable configuration, a state apart from it.
 ///
 /// `start` and the making of the law may allocate; `step`, `applied`, `follow`, `skip` and `record` run in a tick, so they must
-/// neither allocate, block nor panic. What they compute may rest on their arguments alone: then a recorded run replays
-/// to the bit.
+/// neither allocate, block nor panic. Their results must depend on their arguments alone: then a recorded run
+/// replays to the bit.
 pub trait ControlLaw: Debug + Send + 'static {
-    /// What it remembers from tick to tick; workspaces too.
+    /// State from tick to tick, including workspaces.
     type State: Debug + Send + 'static;
 
     /// A state at rest at a command, um.
@@ -138,8 +136,8 @@ pub trait ControlLaw: Debug + Send + 'static {
     /// A tick that the law decides.
     fn step(&self, state: &mut Self::State, input: &LawInput) -> LawOutput;
 
-    /// What came of the wish of this tick's [`ControlLaw::step`]: `applied_um` is the command after the limits, less all that the loop
-    /// added. For anti-windup.
+    /// Result of this tick's [`ControlLaw::step`], for anti-windup: `applied_um` is the command after the limits, minus everything that the
+    /// loop added.
     fn applied(
         &self,
         _state: &mut Self::State,
@@ -149,19 +147,19 @@ pub trait ControlLaw: Debug + Send + 'static {
     ) {
     }
 
-    /// A tick that something else decides (freeze, park, arming, no bead seen yet): `command_um` is what it commanded. A
-    /// law with memory follows, so that it takes over without a bump.
+    /// A tick without the law (freeze, park, arming, no bead seen yet), with its command `command_um`. A law with memory follows, so that it
+    /// takes over without a bump.
     fn follow(&self, _state: &mut Self::State, _input: &LawInput, _command_um: f64) {}
 
-    /// The gain in force has changed by a factor between two ticks ([`Tuning::gain`]): displacements that the state keeps
-    /// (not positions of the bead) are to be multiplied by it, so that the law goes on without a bump.
+    /// Multiplies the displacements in the state, but not positions of the bead, by the factor by which the gain in force has changed
+    /// between two ticks ([`Tuning::gain`]). The law then continues without a bump.
     fn rescale(&self, _state: &mut Self::State, _ratio: f64) {}
 
-    /// The zero flow has moved by a known amount ([`crate::LoopInput::zero_flow_shift_um`]): displacements that the state keeps are to move
-    /// with it, um in the units of [`LawInput`]; those from the zero flow stay.
+    /// Shifts the displacements in the state with a known move of the zero flow ([`crate::LoopInput::zero_flow_shift_um`]), um in the units of
+    /// [`LawInput`]. Displacements relative to the zero flow stay.
     fn shift(&self, _state: &mut Self::State, _by_um: f64) {}
 
-    /// A tick that never came: the command was held.
+    /// A skipped tick: the command was held.
     fn skip(&self, _state: &mut Self::State) {}
 
     /// References of the coming ticks that a step can use; the loop itself looks some ticks ahead.
@@ -186,7 +184,7 @@ pub trait ControlLaw: Debug + Send + 'static {
 /// How long an optimising controller may take in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SolverTerms {
-    /// As long as it needs: the virtual clock.
+    /// No limit: the virtual clock.
     #[default]
     Unlimited,
     /// Until then; the time that it took is reported.
@@ -226,7 +224,7 @@ impl SolverStatus {
     }
 }
 
-/// Account of the optimiser of a tick.
+/// Status and cost of the optimiser in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SolverReport {
     /// How it ended.

@@ -1,4 +1,4 @@
-//! What a loop is built from, what a tick of it is given, and what it gives.
+//! The parts of a loop, and the input and output of one tick.
 
 use crate::estimator::EstimatorConfig;
 use crate::law::{SolverReport, SolverTerms};
@@ -15,11 +15,11 @@ pub struct Measurement {
     pub variance_um2: f64,
     /// Whole ticks by which the frame is older than the nominal delay (0: on time).
     pub age_samples: u16,
-    /// What its time stamp says beyond that, ticks, -1/2 to 1/2; positive: older still.
+    /// Rest of its age by the time stamp, ticks, -1/2 to 1/2; positive: older.
     pub offset_samples: f64,
 }
 
-/// What the loop is to do.
+/// Mode of the loop.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Mode {
     /// Control the bead.
@@ -29,23 +29,23 @@ pub enum Mode {
     Freeze,
     /// Make the hardware safe: slew to the park displacement. The bead is lost.
     Park,
-    /// Open loop: this PZT displacement, um, within the limits. The estimator goes on.
+    /// Open loop: this PZT displacement, um, within the limits. The estimator keeps running.
     Direct(f64),
 }
 
-/// The displacement that stood at the actuator, where it is known to be another than what was commanded: the line was silent,
-/// the board held, or its limits said otherwise.
+/// A displacement of the actuator that is known to differ from the command: the line was silent, the board held, or the board's
+/// limits were narrower.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InForce {
     /// Displacement, um.
     pub displacement_um: f64,
-    /// Ticks up to the one before this for which it stood.
+    /// Ticks for which it was in force, up to the previous one.
     pub ticks: usize,
-    /// The displacement before that, um, and its ticks; 0: what was commanded.
+    /// The displacement before that, um, and its ticks; 0 ticks: the commands were obeyed.
     pub before: (f64, usize),
 }
 
-/// What a tick is given.
+/// Input of a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LoopInput<'a> {
     /// The newest bead position, if there is one.
@@ -54,28 +54,27 @@ pub struct LoopInput<'a> {
     pub reference_um: f64,
     /// References of the coming ticks, the next one first; may be empty.
     pub preview_um: &'a [f64],
-    /// What to do.
+    /// Mode.
     pub mode: Mode,
     /// Added to the controller's wish in [`Mode::Run`], um of PZT: excitation for identification in closed loop.
     pub excitation_um: f64,
-    /// A learned correction of the feed-forward, added in [`Mode::Run`], um of PZT. The estimator is not told of it:
-    /// it is what the plant needs beyond what the model says, so that with it the model is right along the reference.
+    /// A learned correction of the feed-forward, added in [`Mode::Run`], um of PZT. The estimator does not see it: it
+    /// makes up for the difference between plant and model along the reference.
     pub learned_um: f64,
-    /// Gain over the design's that the law's feed-forward is divided by, where it is not to be that in force: what was
-    /// learned is right beside this one.
+    /// Gain, relative to the design's, that divides the law's feed-forward; `None`: the gain in force. A learned correction holds only
+    /// with the gain at which it was learned.
     pub feed_forward_gain: Option<f64>,
-    /// Time since the previous command, s, where it is shorter than a tick: the slew limit holds by the clock.
+    /// Time since the previous command, s, if it is shorter than a tick: the slew limit holds by the clock.
     pub slew_time_s: Option<f64>,
-    /// What stood at the actuator instead of the last commands; `None`: they did. Estimator, law and slew limit go on from it.
+    /// Displacement that replaced the last commands; `None`: they were obeyed. Estimator, law and slew limit continue from it.
     pub in_force: Option<InForce>,
-    /// By how much the zero flow moves with this tick through something that is known, such as a second actuator, um of PZT:
-    /// estimator, law and command go along.
+    /// Known shift of the zero flow in this tick, such as by a second actuator, um of PZT. Estimator, law and command shift with it.
     pub zero_flow_shift_um: f64,
     /// How long an optimising controller may take.
     pub solver: SolverTerms,
 }
 
-/// What happened in a tick.
+/// Events of a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LoopFlags {
     /// The request was outside the range.
@@ -92,7 +91,7 @@ pub struct LoopFlags {
     pub stuck: bool,
 }
 
-/// What a tick gives.
+/// Output of a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LoopOutput {
     /// The command: finite, within range, within slew of the previous one, um.
@@ -109,11 +108,11 @@ pub struct LoopOutput {
     pub neutral_um: f64,
     /// Measurement less its prediction, um; 0 without measurement.
     pub innovation_um: f64,
-    /// What moves the bead along the reference, for learning.
+    /// The part of the command that moves the bead along the reference, for learning.
     pub driven: Driven,
-    /// What happened.
+    /// Events of the tick.
     pub flags: LoopFlags,
-    /// The optimiser's account.
+    /// Status and cost of the optimiser.
     pub solver: SolverReport,
 }
 

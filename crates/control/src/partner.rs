@@ -51,12 +51,12 @@ pub struct PartnerConfig {
     pub step_um: f64,
     /// Displacement to which the PZT is returned, um.
     pub mid_um: f64,
-    /// Moves of its own in place of mid-ranging: identification.
+    /// Planned moves instead of mid-ranging, for identification.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub probe: Option<Probe>,
 }
 
-/// A square wave of the partner about where it stands; the loop is not told of it.
+/// A square wave of the partner about its present displacement; the loop does not know of it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Probe {
@@ -66,12 +66,12 @@ pub struct Probe {
     pub half_period_s: f64,
 }
 
-/// What is known of the partner at a tick.
+/// Input of a tick of the partner.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartnerInput {
     /// Ticks since the last step, 1 or more.
     pub steps: u64,
-    /// Its newest report, if one came: where it stands (um), and whether it takes commands.
+    /// Its newest report, if one came: displacement (um), and whether it takes commands.
     pub report: Option<(f64, bool)>,
     /// Command of the PZT in force, um.
     pub pzt_um: f64,
@@ -79,7 +79,7 @@ pub struct PartnerInput {
     pub held: bool,
 }
 
-/// What a step gives.
+/// Output of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PartnerOutput {
     /// Command to hand over now, um.
@@ -88,7 +88,7 @@ pub struct PartnerOutput {
     pub shift_um: f64,
 }
 
-/// How the partner is.
+/// State of the partner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PartnerStatus {
     /// Not heard yet.
@@ -171,7 +171,7 @@ impl PartnerState {
         self.commands_um[0]
     }
 
-    /// Where it said last that it stands, um; NaN before the first report.
+    /// Displacement in its last report, um; NaN before the first report.
     pub fn applied_um(&self) -> f64 {
         self.applied_um
     }
@@ -373,7 +373,7 @@ impl Partner {
         }
     }
 
-    /// From here on it counts as standing where it was last known to stand.
+    /// From here on it counts as being at its last known displacement.
     fn lose(&self, state: &mut PartnerState) {
         if state.status != PartnerStatus::Lost {
             state.status = PartnerStatus::Lost;
@@ -426,7 +426,7 @@ impl Partner {
         next_um
     }
 
-    /// The nearest step of its converter, um: what stands there is then known.
+    /// The nearest step of its converter, um: the exact output is then known.
     fn on_step(&self, um: f64) -> f64 {
         let PartnerConfig {
             low_um, step_um, ..

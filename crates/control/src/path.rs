@@ -1,7 +1,7 @@
-//! The path of the reference: the command that moves the model along it, and what of the motion that command makes.
+//! The path of the reference: the command that moves the model along it, and the part of the motion that this command causes.
 //!
-//! The reference is known in advance, so no law has to find the command that follows it: the loop adds that command, and the law answers
-//! what the bead does beyond it. A jump that no preview announced moves the path at once and is left to the law.
+//! The reference is known in advance, so no law has to find the command that follows it: the loop adds that command, and the law corrects
+//! the rest. A jump that no preview announced moves the path at once and is left to the law.
 
 use crate::exposure::Past;
 use crate::feedforward::{FeedForward, FeedForwardState, Reach};
@@ -9,8 +9,8 @@ use crate::law::LawInput;
 use crate::limits::Limits;
 use crate::loop_model::LoopModel;
 
-/// Of the slew in a tick, what a planned move leaves to the correction, um of PZT: two standard deviations of what it asks for in a
-/// hold. Where the plan takes all of it the correction comes late, and a jump at 5 kHz takes 3.6 ms in place of 3.
+/// Part of a tick's slew that a planned move leaves to the correction, um of PZT: two standard deviations of the correction in a hold.
+/// Without it the correction comes late, and a jump at 5 kHz takes 3.6 ms instead of 3.
 const RESERVE_UM: f64 = 0.1;
 
 /// The path for one model, range and slew.
@@ -21,7 +21,7 @@ pub(crate) struct Path {
     feedthrough: f64,
 }
 
-/// Where the path stands.
+/// State of the path.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PathState {
     /// The model on the path.
@@ -40,7 +40,7 @@ impl Path {
         }
     }
 
-    /// A tick that the law does not decide: the path stands at the reference.
+    /// A tick without the law: the path is at the reference.
     pub(crate) fn rest(state: &mut PathState, reference_um: f64) {
         *state = PathState {
             on: FeedForward::rest(reference_um),

@@ -1,4 +1,4 @@
-//! References: what the bead is to follow, evaluated at a time without allocation.
+//! References: wanted positions of the bead, evaluated at a time without allocation.
 //!
 //! A [`Reference`] is a pure function of time since its start; scripts compose their own by implementing the trait.
 //! Preview is the same function evaluated at the coming ticks ([`fill_preview`]).
@@ -14,8 +14,8 @@ pub trait Reference {
     /// When it ends, s; `None`: never.
     fn duration_s(&self) -> Option<f64>;
 
-    /// Phase of a periodic reference at a time, in cycles; `None` where it is not periodic (or not yet). What is learned
-    /// over cycles is laid on this phase.
+    /// Phase of a periodic reference at a time, in cycles; `None` while it is not periodic. Learned corrections
+    /// belong to this phase.
     fn phase(&self, time_s: f64) -> Option<f64> {
         let _ = time_s;
         None

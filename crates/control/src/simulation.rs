@@ -10,7 +10,7 @@ use std::collections::VecDeque;
 
 use crate::loop_io::Measurement;
 
-/// What the simulated rig is made of.
+/// Parts of the simulated rig.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigConfig {
     /// The true plant, from displacement relative to neutral to bead position.
@@ -170,7 +170,7 @@ impl SimulatedRig {
         self.hold(before);
     }
 
-    /// A held bead does not move; set free, it goes on from where it is.
+    /// A held bead does not move; when it comes free, it moves on from there.
     fn hold(&mut self, before_um: f64) {
         let free_um = self.free_um();
         if self.stuck {

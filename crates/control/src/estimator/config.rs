@@ -1,4 +1,4 @@
-//! What the estimator is told of noise and plant.
+//! Configuration of the estimator: noise and plant.
 
 use crate::error::{BuildError, check};
 use serde::{Deserialize, Serialize};
@@ -49,7 +49,7 @@ pub struct EstimatorConfig {
     /// Gain and delay of the plant are estimated while the loop runs, and the law follows them.
     #[serde(skip_serializing_if = "is_off")]
     pub adapt: bool,
-    /// What the dither of adaptation may add to the hold error, %: the gain is known by it, with a standard deviation that falls with the root.
+    /// Largest addition of the dither of adaptation to the hold error, %: the gain is known by it, with a standard deviation that falls with the root.
     #[serde(skip_serializing_if = "is_usual_dither")]
     pub dither_percent: f64,
 }

@@ -1,4 +1,4 @@
-//! What a fix shows of a path that bends while the frame is exposed.
+//! The mean that a fix shows of a path that bends during the exposure.
 
 use super::{Estimator, EstimatorState};
 

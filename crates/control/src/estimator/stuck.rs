@@ -7,7 +7,7 @@ use super::{Estimator, EstimatorState, Fix, HISTORY, STUCK_AVERAGE};
 const HELD_EVIDENCE: f64 = 8.0;
 /// Evidence below which it is not: one that is held passes it in two or three fixes, and has had a dozen by then.
 const WALKS_EVIDENCE: f64 = 1.0;
-/// The most evidence that is kept, so that what comes free is noticed.
+/// Largest evidence that is kept, so that a bead that comes free is noticed.
 const MOST_EVIDENCE: f64 = 25.0;
 
 /// A bead that is held stays where it is; one that is not walks. A Kalman filter of one number for either, from the same fix on.

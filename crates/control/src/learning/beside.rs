@@ -1,4 +1,4 @@
-//! A learner beside a loop: each fix is laid on the reference and the phase at the time of its exposure.
+//! A learner attached to a loop: each fix is laid on the reference and the phase at the time of its exposure.
 
 use super::{Driven, LearnedTable, Learner, LearnerState};
 use crate::exposure;
@@ -6,7 +6,7 @@ use crate::exposure;
 /// References of past ticks that a [`CycleLearning`] keeps: the oldest exposure that it can learn from.
 const PAST: usize = 24;
 
-/// A learner beside a loop: it lays each fix on the reference and the phase at the time of its exposure.
+/// A learner attached to a loop: it lays each fix on the reference and the phase at the time of its exposure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CycleLearning {
     learner: Learner,
@@ -20,7 +20,7 @@ pub struct CycleLearning {
 }
 
 impl CycleLearning {
-    /// Puts a learner beside a loop, with the state of [`Learner::start`] or [`Learner::resume`].
+    /// Attaches a learner to a loop, with the state of [`Learner::start`] or [`Learner::resume`].
     pub fn new(learner: Learner, state: LearnerState) -> Self {
         Self {
             learner,
@@ -43,7 +43,7 @@ impl CycleLearning {
     }
 
     /// Before the controller's step: the addition for this tick, um of PZT; see [`crate::LoopInput::learned_um`]. `phase`
-    /// is that of the reference in cycles, `None` where it is not periodic now.
+    /// is that of the reference in cycles, `None` while it is not periodic.
     pub fn addition_um(&mut self, phase: Option<f64>, reference_um: f64) -> f64 {
         let Some(phase) = phase.filter(|p| p.is_finite()) else {
             self.known = 0;

@@ -1,4 +1,4 @@
-//! What a learner is told: responses of the loop, how to learn; and why one cannot be.
+//! Configuration of a learner: responses of the loop, how to learn, and the errors of a configuration.
 
 use crate::error::{BuildError, check};
 use serde::{Deserialize, Serialize};
@@ -20,16 +20,16 @@ pub struct HarmonicResponse {
     pub relative_uncertainty: f64,
 }
 
-/// How a learner learns. Runs of older versions hold keys beside these, of a learner that is no more: they are passed over, so that such a
-/// run can still be read.
+/// How a learner learns. Runs of older versions have further keys. They are ignored, so that such a run can still
+/// be read.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct LearnConfig {
-    /// Shortest time over which an error counts before anything is made of it, cycles and ticks.
+    /// Shortest time over which an error is measured before a correction, cycles.
     pub watch_cycles: f64,
     /// The same in ticks; both must have passed.
     pub watch_ticks: u32,
-    /// Memory in the end, cycles: over so many the noise is averaged, and no faster is a plant followed that changes.
+    /// Final memory, cycles: noise is averaged over it, and a plant that changes faster is not followed.
     pub longest_cycles: f64,
     /// Ticks after a change of the addition until the loop has settled and counts again.
     pub response_ticks: u32,
@@ -97,7 +97,7 @@ impl LearnConfig {
     }
 }
 
-/// A learner that cannot be.
+/// Why a learner cannot be made.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum LearnError {
     /// A value of the configuration.
@@ -125,7 +125,7 @@ pub enum LearnError {
         /// Of the reference, Hz.
         frequency_hz: f64,
     },
-    /// A table with a harmonic that cannot be.
+    /// A table with an impossible harmonic.
     #[error(
         "the learned table has harmonic {harmonic}: must be 1 to {HARMONICS}, below {highest_hz} Hz"
     )]

@@ -1,4 +1,4 @@
-//! What a stretch of ticks with a steady addition tells of the error at the harmonics of the reference.
+//! The error at the harmonics of the reference, from a stretch of ticks with a steady addition.
 //!
 //! The error is differenced in part first (`x_k = e_k - 0.9 e_(k-1)`), which makes what a loop leaves of Brownian motion about
 //! white, so that a stretch of three cycles is not read wrong by a bead that wanders slowly; the phasors are divided by the
@@ -8,9 +8,9 @@ use super::config::HARMONICS;
 use nalgebra::Complex;
 use std::f64::consts::TAU;
 
-/// Part of the last error that is taken off.
+/// Part of the last error that is subtracted.
 const DIFFERENCED: f64 = 0.9;
-/// What the noise is taken to be before any is seen: its variance, um^2, and the ticks that this counts as.
+/// Prior of the noise: its variance, um^2, and its weight in ticks.
 const FIRST_NOISE_UM2: f64 = 0.03 * 0.03;
 const FIRST_NOISE_TICKS: f64 = 6.0;
 /// Ticks over which the noise is averaged.

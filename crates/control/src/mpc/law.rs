@@ -1,4 +1,4 @@
-//! The control law of MPC: a plan each tick, the previous one where there is none, then PI.
+//! The control law of MPC: a plan each tick; without one the previous plan, then PI.
 
 use super::clarabel_qp::{ClarabelQp, Side};
 use super::condensed::{BLOCKS, Condensed, HORIZON, Mpc, SolverKind};

@@ -1,4 +1,4 @@
-//! The problems of a loop, and how long each solver takes for them: for tables beside other solvers.
+//! The problems of a loop, and how long each solver takes for them: for comparison with other solvers.
 
 use super::law::MpcLaw;
 use crate::active_set::{QpEnd, QpMatrices, QpVectors, Stop};
