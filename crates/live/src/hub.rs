@@ -28,10 +28,10 @@ const PAST_CLIPS: usize = 1000;
 /// Rows per message, few enough that a slow client loses little at a time.
 const ROWS_OF_A_MESSAGE: usize = 2000;
 
-/// Messages in words.
+/// Messages as JSON objects.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "kebab-case")]
-enum Told<'a> {
+enum Update<'a> {
     State(&'a State),
     Events(Vec<&'a EventLine>),
     Cycles(Vec<&'a CycleRow>),
@@ -79,9 +79,9 @@ impl Clients {
     }
 }
 
-fn text(told: &Told<'_>) -> Message {
+fn text(update: &Update<'_>) -> Message {
     // Plain data: it always serialises.
-    Message::text(serde_json::to_string(told).unwrap_or_default())
+    Message::text(serde_json::to_string(update).unwrap_or_default())
 }
 
 fn rows_message<'a>(rows: impl ExactSizeIterator<Item = &'a Row>) -> Message {
@@ -154,20 +154,20 @@ impl Past {
         match line {
             Line::State(state) => {
                 let state = self.state.insert(*state);
-                text(&Told::State(state))
+                text(&Update::State(state))
             }
             Line::Event(event) => {
-                let message = text(&Told::Events(vec![&event]));
+                let message = text(&Update::Events(vec![&event]));
                 keep(&mut self.events, event, PAST_EVENTS);
                 message
             }
             Line::Cycle(cycle) => {
-                let message = text(&Told::Cycles(vec![&cycle]));
+                let message = text(&Update::Cycles(vec![&cycle]));
                 keep(&mut self.cycles, cycle, PAST_CYCLES);
                 message
             }
             Line::Clip(clip) => {
-                let message = text(&Told::Clips(vec![&clip]));
+                let message = text(&Update::Clips(vec![&clip]));
                 keep(&mut self.clips, clip, PAST_CLIPS);
                 message
             }
@@ -177,16 +177,16 @@ impl Past {
     /// Sends a new client all kept data.
     fn tell(&self, queue: &Queue) {
         if let Some(state) = &self.state {
-            queue.push(&text(&Told::State(state)));
+            queue.push(&text(&Update::State(state)));
         }
         if !self.events.is_empty() {
-            queue.push(&text(&Told::Events(self.events.iter().collect())));
+            queue.push(&text(&Update::Events(self.events.iter().collect())));
         }
         if !self.cycles.is_empty() {
-            queue.push(&text(&Told::Cycles(self.cycles.iter().collect())));
+            queue.push(&text(&Update::Cycles(self.cycles.iter().collect())));
         }
         if !self.clips.is_empty() {
-            queue.push(&text(&Told::Clips(self.clips.iter().collect())));
+            queue.push(&text(&Update::Clips(self.clips.iter().collect())));
         }
         let mut rows = self.rows.iter();
         let size = rows.len().div_ceil(PAST_MESSAGES).max(ROWS_OF_A_MESSAGE);

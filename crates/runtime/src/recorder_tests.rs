@@ -51,7 +51,7 @@ impl Loop {
 
 /// The calls to a sink, in order.
 #[derive(Debug, PartialEq)]
-enum Told {
+enum Call {
     Tick(u64),
     Event(u64),
     Repeated(u64, u64),
@@ -59,7 +59,7 @@ enum Told {
 
 #[derive(Default)]
 struct Sink {
-    told: Vec<Told>,
+    calls: Vec<Call>,
     panics_at: Option<u64>,
     refuses: bool,
 }
@@ -67,13 +67,13 @@ struct Sink {
 impl RunSink for Sink {
     fn tick(&mut self, record: &TickRecord) {
         assert_ne!(Some(record.seq), self.panics_at, "a defect");
-        self.told.push(Told::Tick(record.seq));
+        self.calls.push(Call::Tick(record.seq));
     }
     fn event(&mut self, event: &Event) {
-        self.told.push(Told::Event(event.seq));
+        self.calls.push(Call::Event(event.seq));
     }
     fn repeated(&mut self, last: &Event, count: u64) {
-        self.told.push(Told::Repeated(last.seq, count));
+        self.calls.push(Call::Repeated(last.seq, count));
     }
     fn is_refused(&self) -> bool {
         self.refuses
@@ -94,13 +94,13 @@ fn a_round_is_bounded_and_takes_records_before_events() {
     let pulse = Pulse::default();
     let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     assert!(recorder.round(0));
-    assert_eq!(recorder.sink.told[0], Told::Tick(0));
+    assert_eq!(recorder.sink.calls[0], Call::Tick(0));
     let ticks = |sink: &Sink| {
-        let tick = |told: &&Told| matches!(told, Told::Tick(_));
-        sink.told.iter().filter(tick).count()
+        let tick = |call: &&Call| matches!(call, Call::Tick(_));
+        sink.calls.iter().filter(tick).count()
     };
     assert_eq!(ticks(recorder.sink), RECORDS_A_ROUND);
-    assert!(recorder.sink.told.len() <= RECORDS_A_ROUND + EVENTS_A_ROUND);
+    assert!(recorder.sink.calls.len() <= RECORDS_A_ROUND + EVENTS_A_ROUND);
     recorder.finish();
     assert_eq!(ticks(&sink), 5000);
 }
@@ -115,22 +115,22 @@ fn equal_events_are_told_by_number_and_none_is_forgotten() {
     from.event(3000, EventKind::Running);
     let (mut sink, mut statistics) = (Sink::default(), Statistics::default());
     Recorder::new(feed, &mut sink, &mut statistics, &Pulse::default()).finish();
-    let mut told = 0;
+    let mut events = 0;
     let mut lines = 0;
-    for line in &sink.told {
+    for line in &sink.calls {
         match line {
-            Told::Event(_) => (told, lines) = (told + 1, lines + 1),
-            Told::Repeated(_, count) => (told, lines) = (told + count, lines + 1),
-            Told::Tick(_) => {}
+            Call::Event(_) => (events, lines) = (events + 1, lines + 1),
+            Call::Repeated(_, count) => (events, lines) = (events + count, lines + 1),
+            Call::Tick(_) => {}
         }
     }
-    assert_eq!(told, 3001);
+    assert_eq!(events, 3001);
     assert!(lines <= 3 * (EVENTS_A_SECOND + 1) + 1, "{lines} lines");
     // A rare event is reported singly, however often another kind comes.
-    assert!(sink.told.contains(&Told::Event(3000)));
+    assert!(sink.calls.contains(&Call::Event(3000)));
     assert!(
-        sink.told
-            .contains(&Told::Repeated(2999, 1000 - EVENTS_A_SECOND))
+        sink.calls
+            .contains(&Call::Repeated(2999, 1000 - EVENTS_A_SECOND))
     );
 }
 
@@ -157,7 +157,7 @@ fn a_sink_that_panics_is_a_fault_and_every_record_after_it_is_counted() {
     }
     let report = recorder.finish();
     assert_eq!(report.records_unkept, 110);
-    assert_eq!(sink.told.len(), 40);
+    assert_eq!(sink.calls.len(), 40);
 }
 
 #[test]

@@ -16,7 +16,7 @@ const NOW_FIXES: f64 = 60.0;
 const STILL: f64 = 0.5;
 /// Largest logarithm of the gain to which caution goes before the estimate knows the cause. A law for 1.3 times the design's gain holds a
 /// plant of twice that gain with Ms below 2. A line causes no larger change.
-const ENOUGH: f64 = 0.26;
+const MOST_CAUTION: f64 = 0.26;
 /// Standard deviations by which the motion of the loop's own commands asks for caution.
 const CAUTION: f64 = 6.0;
 /// Mean square of the residual, over the usual one, that ringing at least leaves: ten standard deviations of a mean of [`NOW_FIXES`]
@@ -110,7 +110,7 @@ impl Adapter {
         let (gain, late) = (state.force.log_gain.exp(), DELAYS[state.force.member]);
         let in_force = dot(&p, &frame.of(late));
         state.now.add(y, in_force);
-        let rise = (state.now.rise(gain, usual_um2)).min(ENOUGH - state.force.log_gain);
+        let rise = (state.now.rise(gain, usual_um2)).min(MOST_CAUTION - state.force.log_gain);
         if rise > 0.0 {
             state.force.go(rise);
         }

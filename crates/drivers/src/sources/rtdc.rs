@@ -77,7 +77,7 @@ impl RtdcRecording {
             cause,
         })?;
         check_whole(path)?;
-        let wrong = |error: Error| told(path, 0, &error);
+        let wrong = |error: Error| source_error(path, 0, &error);
         let file = File::open_streaming(path).map_err(wrong)?;
         let events = file.group("events").and_then(|events| events.datasets());
         let held = |name: &str| {
@@ -155,7 +155,7 @@ impl RtdcRecording {
         index: usize,
         to: &mut FrameBuffer,
     ) -> Result<(), SourceError> {
-        let wrong = |error: Error| told(&info.path, index, &error);
+        let wrong = |error: Error| source_error(&info.path, index, &error);
         let pixels = info.width_px * info.height_px;
         (to.width, to.height) = (info.width_px, info.height_px);
         let bytes = from.element_size().map_err(wrong)?;
@@ -260,7 +260,7 @@ fn number(value: &AttrValue) -> Option<f64> {
     }
 }
 
-fn told(path: &Path, frame: usize, error: &Error) -> SourceError {
+fn source_error(path: &Path, frame: usize, error: &Error) -> SourceError {
     let (path, problem) = (PathBuf::from(path), error.to_string());
     let named = FILTERS
         .iter()

@@ -23,7 +23,7 @@ pub(super) fn screen(
     typed: &str,
 ) {
     let area = frame.area();
-    let script = told(history);
+    let script = steps(history);
     let events = (area.height / 4).clamp(2, 12);
     let [banner, figures, gauge, doing, traces, log, last] = Layout::vertical([
         Constraint::Length(1),
@@ -139,7 +139,7 @@ fn clock(seconds: f64) -> String {
 }
 
 /// The present step, the next one, and their durations.
-fn told(history: &History) -> Vec<(String, Style)> {
+fn steps(history: &History) -> Vec<(String, Style)> {
     let state = &history.state;
     let (plain, quiet) = (Style::new(), Style::new().fg(Color::Gray));
     let mut parts = vec![];

@@ -70,7 +70,7 @@ impl<S: RunSink + Shown> RunSink for Viewed<S> {
             watcher.take_counts(&record.counts);
             // The page shows a freeze as soon as it is in force, not at its next update.
             if watcher.turns(record) {
-                watcher.stands(record, &self.sink);
+                watcher.show_state(record, &self.sink);
             }
         }
     }

@@ -190,7 +190,7 @@ impl Watcher {
     }
 
     /// Reports the state of the run after a tick.
-    pub(super) fn stands(&mut self, record: &TickRecord, sink: &impl Shown) {
+    pub(super) fn show_state(&mut self, record: &TickRecord, sink: &impl Shown) {
         self.state.banner = self.banner(record);
         sink.complete(&mut self.state);
         self.tell_state();
@@ -227,7 +227,7 @@ impl Watcher {
         self.state.rms_nm = statistics.rms_measured_nm();
         self.state.fix_noise_nm = statistics.fix_noise_um().map(|um| um * 1e3);
         self.tails();
-        self.stands(record, sink);
+        self.show_state(record, sink);
     }
 
     /// Reports the tails of the ticks' times, and the lowest possible error, from time to time: a search through all counts.

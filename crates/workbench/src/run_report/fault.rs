@@ -22,7 +22,7 @@ pub(super) fn section(page: &mut Report, sessions: &[Session]) -> Result<(), Fai
         page.section("What happened");
         let what = text(safe).unwrap_or("Safe was latched.");
         page.note(Emphasis::Bad, what);
-        told(page, session, safe);
+        sequence(page, session, safe);
         if !rows.is_empty() {
             page.figure(figure(&rows, session.start_s, safe.time_s));
             page.table(counted(&rows));
@@ -53,14 +53,14 @@ fn rows(reader: &RunReader, at_s: f64) -> Result<Vec<TickRecord>, Failure> {
 }
 
 /// The sentences of that time, in their order.
-fn told(page: &mut Report, session: &Session, safe: &Event) {
+fn sequence(page: &mut Report, session: &Session, safe: &Event) {
     let mut table = Table::new([Column::right("time (s)"), Column::left("what happened")]);
     let span = safe.time_s - BEFORE_S..=safe.time_s + BEHIND_S;
     const MOST: usize = 40;
-    let told: Vec<&Event> = (session.events.iter())
+    let shown: Vec<&Event> = (session.events.iter())
         .filter(|event| span.contains(&event.time_s))
         .collect();
-    for event in told.iter().skip(told.len().saturating_sub(MOST)) {
+    for event in shown.iter().skip(shown.len().saturating_sub(MOST)) {
         let time = format!("{:.3}", session.start_s + event.time_s);
         table.row([time.as_str(), text(event).unwrap_or(&event.event)]);
     }

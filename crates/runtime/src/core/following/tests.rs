@@ -45,10 +45,10 @@ impl Default for World<'_> {
 }
 
 /// When it was found, s, how far the bead was, um, and what it was.
-type Told = (f64, f64, Instead);
+type Finding = (f64, f64, Instead);
 
 /// A proportional loop with an integral on an integrator, which pauses when it is told to.
-fn told(world: &World<'_>) -> Option<Told> {
+fn found_by(world: &World<'_>) -> Option<Finding> {
     let mut state = world.seed;
     let dt = 1.0 / world.rate_hz;
     let model = LoopModel {
@@ -111,7 +111,7 @@ fn a_sign_that_flips_is_told_while_the_bead_is_in_the_picture() {
     for rate_hz in [1000.0, 2000.0, 5000.0] {
         for (gain, axis) in [(1.0, 1.0), (1.4, -1.0), (2.0, 1.0)] {
             for seed in 1..=10 {
-                let told = told(&World {
+                let told = found_by(&World {
                     seed,
                     axis,
                     rate_hz,
@@ -172,7 +172,7 @@ fn half_to_twice_the_gain_and_flows_that_step_drift_or_rise_are_followed() {
         for gain in [0.5, 1.0, 2.0] {
             for (n, zero_flow) in flows.into_iter().enumerate() {
                 for hz in [0.0, 1.0, 20.0] {
-                    let at = told(&World {
+                    let at = found_by(&World {
                         seed,
                         gain_ratio: &|_| gain,
                         zero_flow,
@@ -197,7 +197,7 @@ fn an_actuator_that_clips_near_zero_flow_is_told_under_a_slow_law_within_20_um()
                 (true, true) => [0.0, level_um],
                 (true, false) => [level_um, 40.0],
             };
-            let found = told(&World {
+            let found = found_by(&World {
                 seed,
                 axis,
                 range: &range,
@@ -220,7 +220,7 @@ fn a_loop_that_loses_ticks_in_fast_motion_is_not_taken_for_one_with_a_wrong_sign
             let draw = noise(&mut state).abs();
             draw < 0.5 && (k % 8) as f64 > 12.0 * draw + 2.0
         };
-        let told = told(&World {
+        let told = found_by(&World {
             seed,
             reference: &|t| 3.0 * (t * 95.0).sin() + 2.0 * (t * 311.0).sin(),
             lost: &lost,
@@ -240,7 +240,7 @@ fn an_actuator_that_rings_under_many_lines_is_not_taken_for_one_with_a_wrong_sig
             let line = |t: f64, (n, hz): (usize, &f64)| {
                 0.05 * (std::f64::consts::TAU * hz * t + (seed * (n * n) as u64) as f64).sin()
             };
-            let told = told(&World {
+            let told = found_by(&World {
                 seed,
                 rings: Some((hz, 0.1)),
                 added: &|t| LINES_HZ.iter().enumerate().map(|of| line(t, of)).sum(),
@@ -256,7 +256,7 @@ fn an_actuator_that_rings_under_many_lines_is_not_taken_for_one_with_a_wrong_sig
 fn a_picture_that_shakes_is_not_taken_for_a_bead_that_does_not_follow() {
     for seed in 1..=4 {
         for hz in [8.0, 30.0, 50.0, 77.0, 154.0, 300.0] {
-            let told = told(&World {
+            let told = found_by(&World {
                 seed,
                 shakes: &|t| 0.5 * (std::f64::consts::TAU * hz * t).sin(),
                 seconds: 8.0,
