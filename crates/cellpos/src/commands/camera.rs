@@ -133,7 +133,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
     }
     if !(args.rate_hz.is_finite() && (0.01..=1e6).contains(&args.rate_hz)) {
         return Err(Failure::bad_input(
-            format!("--rate-hz {}: no frame rate", args.rate_hz),
+            format!("--rate-hz {}: out of range", args.rate_hz),
             "give 0.01 to 1e6 Hz",
         ));
     }

@@ -361,8 +361,8 @@ fn limits(args: &Args) -> Result<DesignLimits, Failure> {
         if let Some(value) = given {
             if !(value.is_finite() && value > 0.0) {
                 return Err(Failure::bad_input(
-                    format!("{flag} {value}: must be a positive number"),
-                    "see --help",
+                    format!("{flag} {value}: is not above 0"),
+                    "give a number above 0",
                 ));
             }
             *limit = Some(value);

@@ -239,7 +239,7 @@ fn collectable(args: &Args) -> Result<(), Failure> {
     }
     if !(0.2..=10.0).contains(&args.effort) {
         return Err(Failure::bad_input(
-            format!("--effort {}", args.effort),
+            format!("--effort {}: out of range", args.effort),
             "give 0.2 to 10",
         ));
     }

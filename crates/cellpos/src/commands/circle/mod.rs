@@ -146,7 +146,7 @@ fn checked(args: &Args) -> Result<(), Failure> {
             Ok(())
         } else {
             Err(Failure::bad_input(
-                format!("--{name} {value}{unit}"),
+                format!("--{name} {value}{unit}: out of range"),
                 format!("give {low}{unit} to {high}{unit}"),
             ))
         }

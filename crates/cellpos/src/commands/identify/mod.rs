@@ -197,7 +197,7 @@ fn checked(args: &Args) -> Result<(), Failure> {
             Ok(())
         } else {
             Err(Failure::bad_input(
-                format!("--{name} is {value}{unit}"),
+                format!("--{name} {value}{unit}: not above 0"),
                 format!("give a value above 0, for example --{name} 8{unit}"),
             ))
         }
@@ -211,13 +211,13 @@ fn checked(args: &Args) -> Result<(), Failure> {
         .find(|f| !(f.0.is_finite() && f.0 >= 0.2 && f.0 < 480.0))
     {
         return Err(Failure::bad_input(
-            format!("--frequency {f}"),
+            format!("--frequency {f}: outside the band"),
             "lines lie between 0.2Hz and 480Hz at 1000 frames a second",
         ));
     }
     if args.led_edges != 0 && args.led_edges < 20 {
         return Err(Failure::bad_input(
-            format!("--led-edges {}", args.led_edges),
+            format!("--led-edges {}: too few for a delay", args.led_edges),
             "give 0 (no delay test) or at least 20 edges",
         ));
     }

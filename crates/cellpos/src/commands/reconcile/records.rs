@@ -50,8 +50,8 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
         if path.is_dir() && !is_run(path) {
             let entries = std::fs::read_dir(path).map_err(|e| {
                 Failure::bad_input(
-                    format!("cannot read the folder {}: {e}", path.display()),
-                    "check --data",
+                    format!("--data {}: cannot be read: {e}", path.display()),
+                    "make it readable, or name its files with --data",
                 )
             })?;
             let mut inside: Vec<PathBuf> = entries
@@ -78,8 +78,8 @@ pub(super) fn files(data: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
             found.push(path.clone());
         } else {
             return Err(Failure::bad_input(
-                format!("{} does not exist", path.display()),
-                "check --data",
+                format!("--data {}: does not exist", path.display()),
+                "give a record file, a run folder or a folder of them",
             ));
         }
     }
