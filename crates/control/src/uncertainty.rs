@@ -73,7 +73,7 @@ const LEAST_GAIN_FACTOR: f64 = 1.1;
 /// machine.
 const LEAST_DELAY_S: f64 = 0.05e-3;
 /// Three standard deviations over the half-width of a 95 % interval.
-const THREE_SD: f64 = 3.0 / 1.96;
+const THREE_SD: f64 = 3.0 / cellpos_numeric::statistics::Z95;
 
 impl Uncertainty {
     /// Margins from the intervals of a model, as `cellpos identify` and `cellpos reconcile` write them: three standard

@@ -15,7 +15,7 @@ pub use crate::identified_parameter::{Identifiability, IdentifiedParameter};
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
-use cellpos_numeric::statistics::{quantile, student_t_quantile};
+use cellpos_numeric::statistics::{Z95, quantile, student_t_quantile};
 
 /// The parameters of a fit of candidate orders with verdicts, and the model to use.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,7 +44,7 @@ impl Judged {
 const PROFILE_RISE: f64 = 3.841;
 
 /// Factor from a 95 % to a 99.9 % interval: two 95 % intervals fail to overlap by chance in a few runs of a hundred.
-const SURE: f64 = 3.29 / 1.96;
+const SURE: f64 = 3.29 / Z95;
 
 /// Error that neither LED test nor phase slope covers, s: half of the converter's update step of 0.1 ms. The edges of the LED fall
 /// anywhere in a step; the commands of a loop come at one place in it, which changes with the machine's load.

@@ -17,7 +17,7 @@ use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
 use crate::sampled::Sampling;
-use cellpos_numeric::statistics::f_exceeds;
+use cellpos_numeric::statistics::{Z95, f_exceeds};
 
 /// One line of the compensated response.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -449,8 +449,8 @@ impl Identification {
             continued(model.arg().to_degrees(), -90.0),
         );
         let (g, p) = (
-            1.96 * gain_variance.max(0.0).sqrt(),
-            1.96 * phase_variance.max(0.0).sqrt(),
+            Z95 * gain_variance.max(0.0).sqrt(),
+            Z95 * phase_variance.max(0.0).sqrt(),
         );
         ([gain - g, gain + g], [phase - p, phase + p])
     }

@@ -6,6 +6,9 @@
 use statrs::function::beta::beta_reg;
 use statrs::function::gamma::{gamma_lr, gamma_ur};
 
+/// Standard deviations from the middle of a normal distribution to the ends of its 95 % interval.
+pub const Z95: f64 = 1.96;
+
 /// Probability that a chi-squared variable with `dof` degrees of freedom exceeds `x`.
 pub fn chi2_exceeds(x: f64, dof: f64) -> f64 {
     if x <= 0.0 {

@@ -20,6 +20,13 @@ pub struct Axis {
     pub(crate) range: Option<(f64, f64)>,
 }
 
+/// Places of a curve on a logarithmic axis: `count` evenly in the logarithm.
+pub fn log_grid(low: f64, high: f64, count: usize) -> Vec<f64> {
+    (0..count)
+        .map(|i| low * (high / low).powf(i as f64 / (count - 1) as f64))
+        .collect()
+}
+
 impl Axis {
     /// A linear axis. `unit` is written in brackets after the label; empty for a number without unit.
     pub fn linear(label: &str, unit: &str) -> Self {

@@ -45,7 +45,7 @@ mod thin;
 mod tile;
 mod typeset;
 
-pub use axis::{Axis, Scale};
+pub use axis::{Axis, Scale, log_grid};
 pub use figure::{Figure, HeatMap, Panel};
 pub use html::{Report, ReportError};
 pub use mosaic::Mosaic;

@@ -37,7 +37,7 @@ pub use check::{Check, CheckError, CheckLimits, LimitUse, Violation, WaveCheck, 
 pub use cursor::{Cursor, Output, Progress, Seen, StopReason};
 pub use cycles::{
     Alarm, AmplitudeWatch, AtRest, CycleColumns, CycleFlags, CycleRow, CycleTable, FatigueStop,
-    FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, read_cycles, student95, trend,
+    FatigueWatch, HeadError, Mean, ReadCycles, Saturating, Trend, half95, read_cycles, trend,
 };
 pub use error::ScriptError;
 pub use follow::Follower;

@@ -30,7 +30,10 @@ pub fn text(now: &Adaptation) -> String {
         AdaptMode::AtLimit => "at the end of its range",
     };
     let found = now.gain_estimate.map_or_else(String::new, |[gain, sd]| {
-        format!(", estimated {gain:.2} +- {:.2}", 1.96 * sd)
+        format!(
+            ", estimated {gain:.2} +- {:.2}",
+            cellpos_numeric::statistics::Z95 * sd
+        )
     });
     format!(
         "tuned to {:.2} of the model's gain{found}, {:+.1} samples of delay; {mode}",

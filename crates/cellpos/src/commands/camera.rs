@@ -2,6 +2,7 @@
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_drivers::sources::{self, Playback, Region};
+use cellpos_numeric::statistics;
 use cellpos_numeric::units::Seconds;
 use cellpos_rig::{Camera, CameraError, Clock, FrameBuffer};
 use serde::Serialize;
@@ -337,18 +338,11 @@ fn watch(camera: &mut dyn Camera, args: &Args) -> Delivery {
 }
 
 fn quantiles(mut values: Vec<f64>) -> Quantiles {
-    values.sort_by(f64::total_cmp);
-    let at = |q: f64| {
-        values
-            .get((values.len().saturating_sub(1) as f64 * q).round() as usize)
-            .copied()
-            .unwrap_or(0.0)
-    };
-    Quantiles {
-        p50: at(0.5),
-        p99: at(0.99),
-        max: at(1.0),
+    if values.is_empty() {
+        values.push(0.0);
     }
+    let [p50, p99, max] = statistics::quantiles(&values, [0.5, 0.99, 1.0]);
+    Quantiles { p50, p99, max }
 }
 
 fn report(args: &Args, mut delivery: Delivery, losses: Option<Losses>) -> CommandResult {

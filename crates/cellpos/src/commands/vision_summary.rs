@@ -3,6 +3,7 @@
 use super::vision::Advice;
 use cellpos_drivers::CalibrationFile;
 use cellpos_drivers::sources::RecordingInfo;
+use cellpos_numeric::statistics;
 use cellpos_vision::{Cell, Fix, FixQuality};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -252,10 +253,8 @@ pub(super) fn verdict_name(verdict: FixQuality) -> &'static str {
 }
 
 fn quantile(values: &[f64], q: f64) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let at = (sorted.len().saturating_sub(1) as f64 * q).round() as usize;
-    sorted.get(at).copied().unwrap_or(0.0)
+    let values = if values.is_empty() { &[0.0] } else { values };
+    statistics::quantile(values, q)
 }
 
 fn uniformity(counts: &[u64; BINS]) -> f64 {

@@ -36,7 +36,7 @@ const RANGE: f64 = 2.5;
 /// some 200 ticks, and the gain in force has changed by 10 % then. Half the gain is in force 1.4 s after it is known at 1 kHz.
 const DOWN_PER_TICK: f64 = 0.0005;
 /// Standard deviations of a 95 % interval. A tuning outside of it follows the estimate at once.
-pub(super) const INTERVAL: f64 = 1.96;
+pub(super) const INTERVAL: f64 = cellpos_numeric::statistics::Z95;
 /// Logarithm of the odds by which a delay in force is too short, or too long: it is outside a 95 % interval.
 const DELAY_SURE: f64 = 3.66;
 /// Logarithm of the odds of a change that is reported: one of 3000 is false if the noise is as it is measured.

@@ -22,7 +22,7 @@ pub use rest::AtRest;
 pub use row::{CycleFlags, CycleRow};
 pub use saturating::Saturating;
 pub use table::{CycleColumns, HeadError, ReadCycles, read_cycles};
-pub use trend::{Alarm, AmplitudeWatch, Mean, Trend, student95, trend};
+pub use trend::{Alarm, AmplitudeWatch, Mean, Trend, half95, trend};
 
 use crate::plan::Plan;
 use cellpos_runtime::{Life, Request, Stage, TickFlags, TickRecord};

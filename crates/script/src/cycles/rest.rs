@@ -1,6 +1,7 @@
 //! The cell before the first cycle: the reference of every stretch.
 
 use super::CycleRow;
+use cellpos_numeric::statistics::Z95;
 
 /// Length and area of the cell at rest before the first cycle of a run that has them: means over the rest, with their uncertainty. For a
 /// table of an older version: the values at the start of the first cycle, with unknown uncertainty.
@@ -72,7 +73,7 @@ impl AtRest {
 
     /// Relative half width of the 95 % interval that the length at rest gives every stretch of the run; NaN if unknown.
     pub fn stretch_ci95(&self) -> f64 {
-        1.96 * self.length_sd_um / self.length_um
+        Z95 * self.length_sd_um / self.length_um
     }
 
     /// The largest area of a cycle over that at rest; NaN if one was not measured.

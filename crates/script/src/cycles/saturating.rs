@@ -1,6 +1,7 @@
 //! A law that saturates, as an alternative to the straight line: a cell tires mostly in its first cycles.
 
 use super::minimum::minimum;
+use cellpos_numeric::statistics::Z95;
 use nalgebra::{Matrix3, Vector3};
 
 /// `end + (start - end) exp(-(cycle - first) / cycles)` through a quantity of the cycles.
@@ -52,7 +53,7 @@ pub(super) fn fit(points: &[(f64, f64)], line: f64) -> Option<Saturating> {
         normal += row * row.transpose();
     }
     let covariance = normal.try_inverse()? * variance;
-    let ci95 = |k: usize| 1.96 * covariance[(k, k)].max(0.0).sqrt();
+    let ci95 = |k: usize| Z95 * covariance[(k, k)].max(0.0).sqrt();
     // A law whose constant or height the cycles do not determine does not count.
     let told = ci95(2) < 0.5 * cycles && (start - end).abs() > 2.0 * ci95(0).hypot(ci95(1));
     if !told {

@@ -2,6 +2,7 @@
 
 use super::saturating::{self, Saturating};
 use super::{CycleFlags, CycleRow};
+use cellpos_numeric::statistics::{Z95, student_t_quantile};
 use std::collections::VecDeque;
 
 /// A mean over some cycles.
@@ -42,16 +43,14 @@ impl Trend {
     }
 }
 
-/// Student's t for a two-sided 95 % interval.
-pub fn student95(freedom: usize) -> f64 {
-    const TABLE: [f64; 10] = [
-        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
-    ];
-    let wide = || 1.96 + 2.5 / freedom.max(1) as f64;
-    let index = freedom.checked_sub(1);
-    index
-        .and_then(|index| TABLE.get(index).copied())
-        .unwrap_or_else(wide)
+/// Half the 95 % interval of the mean of `n` values whose squares about it, or about a line, sum up to `squares`, by Student's t.
+/// NaN without a degree of freedom.
+pub fn half95(squares: f64, freedom: usize, n: usize) -> f64 {
+    if freedom == 0 {
+        return f64::NAN;
+    }
+    let freedom = freedom as f64;
+    student_t_quantile(0.975, freedom) * (squares / freedom / n as f64).sqrt()
 }
 
 impl Mean {
@@ -68,7 +67,7 @@ impl Mean {
         Self {
             cycles: points.len() as u64,
             mean,
-            ci95: student95(freedom) * (squares / freedom.max(1) as f64 / n).sqrt(),
+            ci95: half95(squares, freedom, points.len()),
         }
     }
 }
@@ -89,7 +88,7 @@ fn line(points: &[(f64, f64)]) -> Option<(f64, f64, f64)> {
     let per_cycle = sxy / sxx;
     let at = |x: f64| my + per_cycle * (x - mx);
     let sum: f64 = points.iter().map(|(x, y)| (y - at(*x)).powi(2)).sum();
-    Some((per_cycle, 1.96 * (sum / (n - 2.0) / sxx).sqrt(), sum))
+    Some((per_cycle, Z95 * (sum / (n - 2.0) / sxx).sqrt(), sum))
 }
 
 /// The trend of `(cycle, value)` pairs in their order; values that are not finite are left out. None with fewer than five.

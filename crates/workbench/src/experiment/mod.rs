@@ -3,6 +3,7 @@
 //! - [`identify`]: the whole identification, on the emulated rig or on yours ([`on_rig`]).
 //! - [`collect`]: the experiments that reconcile needs. [`excitation`]: their signals.
 //! - [`circle`]: identify, reconcile, design, track. [`partner`]: gain, lag and delay of a slow actuator.
+//! - [`paper`]: the numbers of Mizoue et al. 2017.
 //!
 //! A segment of an experiment, on the emulated rig (another: `RigFile::load` with a path):
 //!
@@ -27,5 +28,6 @@ pub mod excitation;
 mod exciting;
 pub mod identify;
 pub mod on_rig;
+pub mod paper;
 pub mod partner;
 mod rows;

@@ -9,15 +9,13 @@ use crate::experiment::on_rig::OnRig;
 use crate::experiment::rows::fix_noise_um;
 use cellpos_control::Probe;
 use cellpos_ident::least_squares::{covariance, minimise};
+use cellpos_numeric::statistics::Z95;
 use cellpos_plant::{Model, Simulator};
 use cellpos_runtime::{EndRule, Event, RunSink, Statistics, TickFlags, TickRecord};
 use cellpos_session::setup::{Prepared, ReferenceSpec};
 use cellpos_session::{EndKind, Failure, Rig};
 use serde::Serialize;
 use std::sync::mpsc::{Sender, channel};
-
-/// Standard deviations that contain 95 % of a normal distribution.
-const Z95: f64 = 1.96;
 
 /// How the partner is moved.
 #[derive(Debug, Clone, Copy, PartialEq)]

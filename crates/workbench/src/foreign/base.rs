@@ -4,6 +4,7 @@ use super::form::richer;
 use cellpos_ident::base::{BaseFit, Form, Series, choose};
 use cellpos_ident::rational::RationalFit;
 use cellpos_ident::sampled::Hold;
+use cellpos_numeric::statistics::Z95;
 use cellpos_plant::{Model, Noise, TransferFunction, effects};
 use cellpos_report::{number, with_interval};
 use cellpos_session::Failure;
@@ -236,7 +237,7 @@ impl Base {
             match self.fit.form.delay {
                 true => format!(
                     "delay {} ms",
-                    with_interval(m.delay_s * 1e3, 1.96e3 * m.delay_sd_s)
+                    with_interval(m.delay_s * 1e3, 1e3 * Z95 * m.delay_sd_s)
                 ),
                 false => "no delay".to_owned(),
             },
@@ -282,7 +283,7 @@ pub fn coefficients(values: &[f64], sds: &[f64]) -> String {
         .zip(sds)
         .map(|(value, sd)| match *sd {
             0.0 => number(*value),
-            sd => format!("{} +- {}", number(*value), number(1.96 * sd)),
+            sd => format!("{} +- {}", number(*value), number(Z95 * sd)),
         })
         .collect();
     format!("[{}]", terms.join(", "))
@@ -303,7 +304,7 @@ pub fn model_of(best: &RationalFit, hold: Hold, at_rest: f64) -> Result<Model, F
     let delay_s = best.delay_s.max(0.0);
     let mut intervals = BTreeMap::new();
     if best.delay_sd_s.is_finite() && best.delay_sd_s > 0.0 && delay_s > 0.0 {
-        let wide_s = 1.96 * best.delay_sd_s;
+        let wide_s = Z95 * best.delay_sd_s;
         intervals.insert(
             "time-delay.delay_s".to_owned(),
             [best.delay_s - wide_s, best.delay_s + wide_s],

@@ -1,7 +1,7 @@
 //! The cycles of a run: trends of each motion, and the static arm.
 
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table, with_interval};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, student95, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, ReadCycles, Trend, trend};
 use std::collections::BTreeMap;
 
 /// A quantity of the cycles.
@@ -308,12 +308,9 @@ pub(super) fn short(value: f64) -> String {
 /// Half the width of the 95 % interval of a mean, by Student's t.
 pub fn half95(values: &[f64]) -> f64 {
     let n = values.len();
-    if n < 2 {
-        return f64::NAN;
-    }
     let mean = values.iter().sum::<f64>() / n as f64;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    student95(n - 1) * (squares / (n - 1) as f64 / n as f64).sqrt()
+    cellpos_script::half95(squares, n.saturating_sub(1), n)
 }
 
 fn trend_json(quantity: &Quantity, group: &Group, found: &Trend) -> serde_json::Value {

@@ -140,10 +140,14 @@ impl<const N: usize> Envelope<N> {
                 let samples = some
                     .iter()
                     .flat_map(|stretch| stretch.samples.iter().take(stretch.sampled));
-                let mut values: Vec<f64> =
-                    samples.map(at).filter(|value| value.is_finite()).collect();
+                let values: Vec<f64> = samples.map(at).filter(|value| value.is_finite()).collect();
                 let time_s = some.first().map_or(f64::NAN, |stretch| stretch.time_s);
-                course.push(time_s, low, median(&mut values), high);
+                course.push(
+                    time_s,
+                    low,
+                    cellpos_numeric::statistics::median(&values),
+                    high,
+                );
             }
             course.push(f64::NAN, f64::NAN, f64::NAN, f64::NAN);
         }
@@ -163,17 +167,6 @@ impl<const N: usize> Envelope<N> {
     /// Whether each point of a [`Course`] is one row: then there is no envelope.
     pub(super) fn is_bare(&self) -> bool {
         self.rows == 1 && self.stretches.len() <= COLUMNS
-    }
-}
-
-/// The middle of some values; NaN of none.
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    match (values.get(middle), values.len() % 2) {
-        (Some(upper), 0) => 0.5 * (upper + values[middle - 1]),
-        (Some(only), _) => *only,
-        (None, _) => f64::NAN,
     }
 }
 

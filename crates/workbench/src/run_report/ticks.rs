@@ -6,6 +6,7 @@ use super::envelope::Envelope;
 use super::spectrum::Welch;
 use super::spread::{Decades, Spread};
 use super::unused::Unused;
+use cellpos_numeric::statistics::Z95;
 use cellpos_runtime::{Hold, Statistics, TickRecord};
 use std::collections::VecDeque;
 
@@ -303,7 +304,7 @@ impl Ticks {
         let squares: f64 = spectrum.nm_per_rthz.iter().map(|nm| nm.powi(4)).sum();
         let variance_sd = (squares * (second - first) / self.counted_s()).sqrt();
         let rms_nm = self.rms_um()? * 1e3;
-        Some(1.96 * variance_sd / (2.0 * rms_nm) * 1e-3)
+        Some(Z95 * variance_sd / (2.0 * rms_nm) * 1e-3)
     }
 
     /// Mean error, um.

@@ -1,12 +1,6 @@
 //! `cellpos identify`: excite, measure the frequency response, fit, write model.toml and a report.
 
-mod bode;
 mod foreign;
-pub(crate) mod json;
-pub(crate) mod report;
-mod response;
-mod sources;
-mod tables;
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -24,7 +18,7 @@ use cellpos_session::provenance::command_text;
 use cellpos_session::rig_file::ActuatorConfig;
 use cellpos_session::view::{Page, Pages};
 use cellpos_workbench::experiment::identify::held_bead::Setup;
-use cellpos_workbench::experiment::identify::{self as identification, Excitation};
+use cellpos_workbench::experiment::identify::{self as identification, Excitation, page, said};
 use cellpos_workbench::experiment::on_rig::OnRig;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -350,7 +344,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         ));
     }
     if let Some(path) = &args.response {
-        return response::run(&args, path);
+        return foreign::run_response(&args, path);
     }
     if !args.data.is_empty() {
         return foreign::run(&args);
@@ -425,18 +419,18 @@ pub(crate) fn run(args: Args) -> CommandResult {
             .map_err(Failure::failed)?
     };
     output::write(&model_path, &model.to_toml_string())?;
-    report::report(&done, &rig, &command_text(), args.eq6)
+    page::report(&done, &rig, &command_text(), args.eq6)
         .write_with_figures(&report_path)
         .map_err(Failure::failed)?;
     if args.json {
-        print_json(&json::identification(
+        print_json(&said::identification(
             &done,
             &job,
             &model_path,
             &report_path,
         ))?;
     } else {
-        print_text(&json::text(&done, &model_path, &report_path))?;
+        print_text(&said::text(&done, &model_path, &report_path))?;
     }
     Ok(Outcome::Done)
 }

@@ -3,7 +3,9 @@
 //! The steps get a model and a rig; the hidden model stays in the rig. On the emulated rig the truth is known, so the margins that
 //! each model predicts are compared with those of the loop.
 
+mod answer;
 pub mod margins;
+pub mod page;
 pub mod stage;
 
 use crate::experiment::collect::{self, Collected, Collecting, Ran};

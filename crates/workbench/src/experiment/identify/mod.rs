@@ -2,7 +2,9 @@
 
 pub mod held_bead;
 pub mod led;
+pub mod page;
 mod partial;
+pub mod said;
 
 use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
 use cellpos_ident::excitation::ExcitationLimits;

@@ -1,8 +1,9 @@
 //! Mean and spread of the cells of a queue: a row per cell, one page for all.
 
 use crate::commands::run::over::Over;
+use cellpos_numeric::statistics::student_t_quantile;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table, with_interval};
-use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, student95, trend};
+use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Trend, trend};
 use cellpos_session::provenance::command_text;
 use cellpos_workbench::run_report::{OF_LENGTH, half95, length_between, rig_of, was_elsewhere};
 use serde::Serialize;
@@ -171,7 +172,7 @@ fn mean_course(courses: &[Vec<(f64, f64)>]) -> [Vec<f64>; 4] {
     for (cycle, values) in &at {
         let n = values.len();
         // A cell differs from the others in each of its cycles alike: more cycles are no more cells.
-        let half = student95(n - 1) * sd / (n as f64).sqrt();
+        let half = student_t_quantile(0.975, (n - 1) as f64) * sd / (n as f64).sqrt();
         let mean = mean(values);
         for (column, value) in
             columns

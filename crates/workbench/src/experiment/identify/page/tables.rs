@@ -2,6 +2,7 @@
 
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
+use cellpos_numeric::statistics::Z95;
 use cellpos_plant::{Hertz, TransferFunction};
 use cellpos_report::{Column, Emphasis, Table, number};
 
@@ -10,7 +11,7 @@ pub(super) fn interval(ends: [f64; 2]) -> String {
 }
 
 /// The table of parameters with verdicts.
-pub(crate) fn parameters(parameters: &[IdentifiedParameter]) -> Table {
+pub fn parameters(parameters: &[IdentifiedParameter]) -> Table {
     let mut table = Table::new([
         Column::left("parameter"),
         Column::right("value"),
@@ -43,7 +44,7 @@ pub(crate) fn parameters(parameters: &[IdentifiedParameter]) -> Table {
 }
 
 /// The table of frequencies, with Eq. (6) on request.
-pub(crate) fn lines(result: &Identification, eq6: bool) -> Table {
+pub fn lines(result: &Identification, eq6: bool) -> Table {
     let nominal = TransferFunction::eq6();
     let heads = [
         ("Hz", false),
@@ -64,10 +65,10 @@ pub(crate) fn lines(result: &Identification, eq6: bool) -> Table {
         let cells = [
             format!("{}", p.frequency_hz),
             format!("{:.3}", p.gain_db),
-            format!("{:.3}", 1.96 * p.gain_sd_db),
+            format!("{:.3}", Z95 * p.gain_sd_db),
             format!("{:.2}", nominal.gain_db(Hertz(p.frequency_hz)).0),
             format!("{:.2}", p.phase_deg),
-            format!("{:.2}", 1.96 * p.phase_sd_deg),
+            format!("{:.2}", Z95 * p.phase_sd_deg),
             format!("{:.2}", nominal.phase_deg(Hertz(p.frequency_hz)).0),
             format!("{:.1}", p.delayed_phase_deg),
             format!("{:.1}", p.raw_phase_deg),
@@ -84,7 +85,7 @@ pub(crate) fn lines(result: &Identification, eq6: bool) -> Table {
 }
 
 /// The table of candidate orders.
-pub(crate) fn candidates(result: &Identification) -> Table {
+pub fn candidates(result: &Identification) -> Table {
     let mut table = Table::new([
         Column::left("model"),
         Column::right("chi2"),

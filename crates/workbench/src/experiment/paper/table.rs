@@ -3,13 +3,13 @@
 use super::Drifting;
 use super::figures::Recorded;
 use super::row::{DELAY_MS, GAIN_DB, PHASE_DEG, Row, row, wrong};
-use crate::outcome::Failure;
+use crate::experiment::identify::Done;
 use cellpos_ident::excitation::{PAPER_FREQUENCIES_HZ, check_grid};
 use cellpos_ident::identifiability::IdentifiedParameter;
 use cellpos_ident::summary::literal_per_hertz;
 use cellpos_plant::{EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
 use cellpos_report::number;
-use cellpos_workbench::experiment::identify::Done;
+use cellpos_session::Failure;
 
 fn within(value: f64, target: f64, tolerance: f64) -> bool {
     (value - target).abs() <= tolerance

@@ -1,9 +1,9 @@
 //! What `cellpos identify` prints.
 
+use crate::experiment::identify::{Done, Job};
 use cellpos_ident::identifiability::Identifiability;
 use cellpos_plant::{Hertz, TransferFunction};
 use cellpos_report::number;
-use cellpos_workbench::experiment::identify::{Done, Job};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 use std::path::Path;
@@ -22,7 +22,7 @@ fn ends(interval: [f64; 2]) -> Value {
 }
 
 /// The JSON object of an identification of the emulated rig.
-pub(crate) fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Value {
+pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Value {
     let result = &done.result;
     let eq6 = TransferFunction::eq6();
     let mut parameters = Map::new();
@@ -109,7 +109,7 @@ pub(crate) fn identification(done: &Done, job: &Job, model: &Path, report: &Path
 }
 
 /// The same for reading.
-pub(crate) fn text(done: &Done, model: &Path, report: &Path) -> String {
+pub fn text(done: &Done, model: &Path, report: &Path) -> String {
     let result = &done.result;
     let mut out = format!("model  {}\n", result.selection.best().order.formula());
     for p in &result.judged.parameters {

@@ -1,20 +1,19 @@
-//! What `cellpos identify --data` reads: run folders and records of cellpos; other files by their columns.
+//! Records to identify: run folders and records of cellpos; other files by their columns.
 
-use super::{Args, HoldKind};
-use crate::outcome::Failure;
+use super::arrays::read_table;
+use super::columns::{self, Wanted};
 use cellpos_record::RunReader;
 use cellpos_runtime::{Life, TickFlags, TickRecord};
+use cellpos_session::Failure;
 use cellpos_session::recorded;
 use cellpos_session::sessions;
 use cellpos_session::setup::{ReferenceSpec, SetupConfig};
 use cellpos_table::{ColumnRef, Table};
-use cellpos_workbench::foreign::arrays::read_table;
-use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A record and its properties.
-pub(super) struct Source {
+pub struct Source {
     /// File or folder, and session where a run has several.
     pub name: String,
     /// Rows per second.
@@ -29,24 +28,16 @@ pub(super) struct Source {
     pub closed: bool,
 }
 
-/// Reads a file or a run folder.
-pub(super) fn read(path: &Path, args: &Args) -> Result<Vec<Source>, Failure> {
+/// Reads a file by its columns if they are stated, else a record of cellpos, or a run folder session by session.
+///
+/// # Errors
+/// A file that cannot be read or is no record, a run without a closed loop, the run of an identification.
+pub fn read(path: &Path, stated: Option<&Wanted>) -> Result<Vec<Source>, Failure> {
     if path.is_dir() {
         return runs(path);
     }
-    if let (Some(input), Some(output)) = (&args.input, &args.output) {
-        let record = columns::read(
-            path,
-            &Wanted {
-                input,
-                output: Some(output),
-                time: args.time_column.as_deref(),
-                rate: args.rate,
-                factors: [1.0, 1.0],
-                rows: args.rows.as_deref(),
-                held: args.hold == HoldKind::ZeroOrder,
-            },
-        )?;
+    if let Some(wanted) = stated {
+        let record = columns::read(path, wanted)?;
         return Ok(vec![Source {
             name: path.display().to_string(),
             rate_hz: 1.0 / record.sample_s,

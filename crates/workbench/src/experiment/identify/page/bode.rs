@@ -2,19 +2,13 @@
 
 use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::summary::Identification;
+use cellpos_numeric::statistics::Z95;
 use cellpos_plant::{Complex, EQ5_VELOCITY_GAIN_PER_S, Hertz, TransferFunction};
-use cellpos_report::{Axis, Figure, Panel, Series};
-
-/// Frequencies for curves, Hz: `count` evenly in the logarithm.
-pub(crate) fn log_grid(low_hz: f64, high_hz: f64, count: usize) -> Vec<f64> {
-    (0..count)
-        .map(|i| low_hz * (high_hz / low_hz).powf(i as f64 / (count - 1) as f64))
-        .collect()
-}
+use cellpos_report::{Axis, Figure, Panel, Series, log_grid};
 
 /// What a Bode plot shows beyond the points and the fit.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Shown {
+pub struct Shown {
     /// Up to where the fit is drawn, Hz.
     pub high_hz: f64,
     /// Eq. (6) and the integrator of Eq. (5).
@@ -57,7 +51,7 @@ impl Part {
 }
 
 /// Bode plot of the compensated points and the fitted model; beside it both less the fit, with its 95 % band.
-pub(crate) fn bode(name: &str, caption: &str, result: &Identification, shown: Shown) -> Figure {
+pub fn bode(name: &str, caption: &str, result: &Identification, shown: Shown) -> Figure {
     let mut figure = Figure::new(name, caption).columns(2);
     for part in [Part::Gain, Part::Phase] {
         figure = figure
@@ -75,8 +69,8 @@ fn panel(result: &Identification, part: Part, less_fit: bool, shown: Shown) -> P
     let f: Vec<f64> = points.iter().map(|p| p.frequency_hz).collect();
     let value = |sign: f64| -> Vec<f64> {
         let of = |p: &cellpos_ident::summary::CompensatedPoint| match part {
-            Part::Gain => p.gain_db + sign * 1.96 * p.gain_sd_db,
-            Part::Phase => p.phase_deg + sign * 1.96 * p.phase_sd_deg,
+            Part::Gain => p.gain_db + sign * Z95 * p.gain_sd_db,
+            Part::Phase => p.phase_deg + sign * Z95 * p.phase_sd_deg,
         };
         points.iter().map(|p| of(p) - off(p.frequency_hz)).collect()
     };
@@ -102,7 +96,7 @@ fn panel(result: &Identification, part: Part, less_fit: bool, shown: Shown) -> P
             p.phase_sd_deg
         };
         let [low, high] = ends_of(p.frequency_hz);
-        high - low <= WIDEST_BAND * 2.0 * 1.96 * sd
+        high - low <= WIDEST_BAND * 2.0 * Z95 * sd
     });
     if less_fit && describes {
         // Beyond the measured frequencies the band is the form's, no measurement's.

@@ -1,11 +1,11 @@
 //! What came out of a circle, in sentences.
 
+use crate::experiment::circle::Circle;
+use crate::experiment::circle::stage::{Stage, Tracked};
+use crate::run_report::half95;
 use cellpos_reconcile::{Reconciliation, Verdict};
 use cellpos_report::Emphasis;
 use cellpos_report::with_interval;
-use cellpos_workbench::experiment::circle::Circle;
-use cellpos_workbench::experiment::circle::stage::{Stage, Tracked};
-use cellpos_workbench::run_report::half95;
 
 /// One of a stage's two runs.
 pub(super) type OfStage = fn(&Stage) -> Option<&Tracked>;

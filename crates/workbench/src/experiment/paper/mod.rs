@@ -1,4 +1,4 @@
-//! `cellpos paper`: the figures and numbers of Mizoue et al. 2017 from the emulated rig, through frames.
+//! The figures and numbers of Mizoue et al. 2017 from the emulated rig, through frames.
 //!
 //! Where the paper is inconsistent the table says so with the numbers. The bead is held during the excitation: in open loop the
 //! paper's 1.6 um peak to peak at 2 Hz would move it 54 um; only Fig. A1 is an open-loop record.
@@ -7,8 +7,8 @@ mod figures;
 mod row;
 mod table;
 
-use super::identify::new_run_folder;
-use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use super::identify::held_bead::{HeldBead, Setup};
+use super::identify::{Done, Excitation, Job, page as plots, run as identify};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::bare_fft;
 use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ, Signal, Tone};
@@ -17,27 +17,38 @@ use cellpos_ident::frequency_response::{DrivenStretch, Settings, measure};
 use cellpos_plant::Model;
 use cellpos_report::{Column, Emphasis, Report, Table};
 use cellpos_rig::Clock;
-use cellpos_workbench::experiment::identify::held_bead::{HeldBead, Setup};
-use cellpos_workbench::experiment::identify::{Done, Excitation, Job, run as identify};
-use std::path::PathBuf;
+use cellpos_session::Failure;
+use serde_json::Value;
+use std::path::Path;
 
-/// Arguments of `cellpos paper`.
-#[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  cellpos paper --report paper.html")]
-pub(crate) struct Args {
-    /// Seed of the emulated rig.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
-    /// Report [default: report.html in a new folder of runs/].
-    #[arg(long)]
-    report: Option<PathBuf>,
-    /// Print one JSON object on standard output.
-    #[arg(long)]
-    json: bool,
+/// The paper repeated: what was measured, and its numbers beside ours.
+pub struct Paper {
+    done: Done,
+    drifting: Drifting,
+    recorded: figures::Recorded,
+    rows: Vec<row::Row>,
+}
+
+/// Repeats the paper's measurements on the emulated rig.
+///
+/// # Errors
+/// A rig that cannot be emulated, or a bead that is lost.
+pub fn measured(seed: u64) -> Result<Paper, Failure> {
+    let done = identify(&job(seed), |_, _| {})?;
+    let delay_s = done.result.judged.model.delay_s;
+    let drifting = drifting(seed, delay_s)?;
+    let recorded = figures::recorded_amplitudes();
+    let rows = table::rows(&done, &drifting, &recorded)?;
+    Ok(Paper {
+        done,
+        drifting,
+        recorded,
+        rows,
+    })
 }
 
 /// Appendix B repeated: an open-loop record at 10 Hz with drift.
-pub(crate) struct Drifting {
+struct Drifting {
     /// Commanded displacement, um, and bead, um.
     record: RecordedSegment,
     /// Phase by the bare FFT, hold taken off, recording delay left in, deg.
@@ -155,34 +166,6 @@ fn job(seed: u64) -> Job {
     }
 }
 
-/// Runs `cellpos paper`.
-pub(crate) fn run(args: Args) -> CommandResult {
-    crate::output::ready(&args.report)?;
-    let done = identify(&job(args.seed), |_, _| {})?;
-    let delay_s = done.result.judged.model.delay_s;
-    let drifting = drifting(args.seed, delay_s)?;
-    let recorded = figures::recorded_amplitudes();
-    let rows = table::rows(&done, &drifting, &recorded)?;
-    let path = match &args.report {
-        Some(path) => path.clone(),
-        None => new_run_folder("paper")?.join("report.html"),
-    };
-    report(&done, &drifting, &recorded, &rows)
-        .write_with_figures(&path)
-        .map_err(Failure::failed)?;
-    let broken = rows.iter().filter(|r| !r.holds).count();
-    if args.json {
-        print_json(&row::json(&rows, &path, args.seed))?;
-    } else {
-        print_text(&row::text(&rows, &path))?;
-    }
-    Ok(if broken == 0 {
-        Outcome::Done
-    } else {
-        Outcome::Broken
-    })
-}
-
 /// What came out, with some of the numbers.
 fn sentence(rows: &[row::Row]) -> String {
     let count = |is: &dyn Fn(&row::Row) -> bool| rows.iter().filter(|row| is(row)).count();
@@ -216,13 +199,34 @@ fn sentence(rows: &[row::Row]) -> String {
     text
 }
 
+impl Paper {
+    /// The page.
+    pub fn report(&self) -> Report {
+        report(&self.done, &self.drifting, &self.recorded, &self.rows)
+    }
+
+    /// Numbers that differ from the paper's although it does not contradict itself.
+    pub fn differ(&self) -> usize {
+        self.rows.iter().filter(|row| !row.holds).count()
+    }
+
+    /// The JSON object.
+    pub fn to_json(&self, report: &Path, seed: u64) -> Value {
+        row::json(&self.rows, report, seed)
+    }
+
+    /// The same for reading.
+    pub fn text(&self, report: &Path) -> String {
+        row::text(&self.rows, report)
+    }
+}
+
 fn report(
     done: &Done,
     drifting: &Drifting,
     recorded: &figures::Recorded,
     rows: &[row::Row],
 ) -> Report {
-    use super::identify::report as plots;
     let mut report =
         Report::new("Mizoue et al. 2017, Micromachines 8(3):80, from the emulated rig");
     let held = rows.iter().filter(|row| row.holds).count();

@@ -1,11 +1,11 @@
 //! The circle on one page: what was found, margins predicted and true, tracking errors, before and after.
 
 use super::answer::{RUNS, delays_differ, error, rms, sentence, verdict_and_names};
+use crate::experiment::circle::Circle;
+use crate::experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
+use crate::experiment::circle::stage::Stage;
 use cellpos_report::{Axis, Column, Emphasis, Figure, Panel, Report, Series, Table};
 use cellpos_session::provenance::command_text;
-use cellpos_workbench::experiment::circle::Circle;
-use cellpos_workbench::experiment::circle::margins::{AMPLITUDES_UM, LoopMargins, Response};
-use cellpos_workbench::experiment::circle::stage::Stage;
 use std::path::Path;
 
 fn effects(stage: &Stage) -> String {
@@ -148,7 +148,7 @@ fn traces(circle: &Circle) -> Figure {
 }
 
 /// The page.
-pub(super) fn report(circle: &Circle, gap: &Path) -> Report {
+pub fn report(circle: &Circle, gap: &Path) -> Report {
     let mut r = Report::new("Closed circle: identify, reconcile, design again, track");
     let m = circle.motion;
     r.lead(&format!(
@@ -344,7 +344,7 @@ fn margins_table(circle: &Circle) -> Table {
 }
 
 /// The same for a terminal.
-pub(super) fn text(circle: &Circle, out: &Path, html: &Path) -> String {
+pub fn text(circle: &Circle, out: &Path, html: &Path) -> String {
     use std::fmt::Write as _;
     let mut s = String::new();
     let _ = writeln!(s, "verdict: {}", verdict_and_names(circle));

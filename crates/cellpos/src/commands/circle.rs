@@ -3,9 +3,6 @@
 //! The loop gets a model and a rig; the hidden model stays in the rig. On the emulated rig the truth is known, so the margins that
 //! each model predicts are compared with those of the loop.
 
-mod answer;
-mod report;
-
 use crate::commands::identify::new_run_folder;
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::output;
@@ -13,7 +10,7 @@ use crate::rig_file::{ClockKind, Frames, RigFile};
 use cellpos_numeric::units::{Hertz, Micrometers, Seconds};
 use cellpos_plant::Model;
 use cellpos_workbench::experiment::circle::stage::{Motion, Stage};
-use cellpos_workbench::experiment::circle::{Circle, Job, close};
+use cellpos_workbench::experiment::circle::{Circle, Job, close, page};
 use cellpos_workbench::experiment::on_rig::OnRig;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -169,7 +166,7 @@ fn write(args: &Args, circle: &Circle, folder: &Path) -> CommandResult {
     cellpos_reconcile::report(&circle.reconciled, "circle")
         .write(&gap)
         .map_err(Failure::failed)?;
-    report::report(circle, &gap)
+    page::report(circle, &gap)
         .write_with_figures(&html)
         .map_err(Failure::failed)?;
     let value = json!({
@@ -192,7 +189,7 @@ fn write(args: &Args, circle: &Circle, folder: &Path) -> CommandResult {
     if args.json {
         print_json(&value)?;
     } else {
-        print_text(&report::text(circle, &out, &html))?;
+        print_text(&page::text(circle, &out, &html))?;
     }
     let closed = circle.stages.last().is_some_and(Stage::ran)
         && circle.reconciled.verdict != cellpos_reconcile::Verdict::Unknown;

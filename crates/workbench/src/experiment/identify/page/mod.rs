@@ -1,16 +1,20 @@
 //! The report of an identification: Bode with bands, Nyquist, residuals, traces, delay test, parameters.
 
-pub(crate) use super::bode::{Shown, bode, log_grid};
-use super::tables::interval;
-pub(crate) use super::tables::{candidates, lines, parameters};
+mod bode;
+mod tables;
+
+use crate::experiment::identify::Done;
+pub use bode::{Shown, bode};
 use cellpos_ident::frequency_response::FrequencyPoint;
 use cellpos_ident::identifiability::{Identifiability, IdentifiedParameter};
 use cellpos_ident::summary::Identification;
-use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series, number};
-use cellpos_workbench::experiment::identify::Done;
+use cellpos_numeric::statistics::Z95;
+use cellpos_report::{Axis, Emphasis, Figure, Panel, Report, Series, log_grid, number};
+use tables::interval;
+pub use tables::{candidates, lines, parameters};
 
 /// Nyquist plot of the record and the fitted model with hold and delay.
-pub(crate) fn nyquist(result: &Identification) -> Figure {
+pub fn nyquist(result: &Identification) -> Figure {
     let (re, im): (Vec<f64>, Vec<f64>) = result
         .measured
         .points
@@ -37,7 +41,7 @@ pub(crate) fn nyquist(result: &Identification) -> Figure {
 }
 
 /// Residuals of the fit over their standard deviations.
-pub(crate) fn residuals(result: &Identification) -> Figure {
+pub fn residuals(result: &Identification) -> Figure {
     let mut f = Vec::new();
     let (mut re, mut im) = (Vec::new(), Vec::new());
     for p in &result.measured.points {
@@ -56,13 +60,13 @@ pub(crate) fn residuals(result: &Identification) -> Figure {
         Panel::new(Axis::log("frequency", "Hz"), Axis::linear("residual", "standard deviations"))
             .series(Series::points("gain", &f, &re))
             .series(Series::points("phase", &f, &im))
-            .horizontal(-1.96, "")
-            .horizontal(1.96, ""),
+            .horizontal(-Z95, "")
+            .horizontal(Z95, ""),
     )
 }
 
 /// Time traces: command about its mean and bead, the last part of each segment.
-pub(crate) fn traces(done: &Done) -> Figure {
+pub fn traces(done: &Done) -> Figure {
     let mut figure = Figure::new(
         "traces",
         "Commanded displacement (times 4) and bead position of each segment, about their means: three periods, 50 ms at least.",
@@ -105,10 +109,10 @@ pub(crate) fn traces(done: &Done) -> Figure {
 }
 
 /// The delay test: light sent and seen, and the intervals that the edges leave for the delay.
-pub(crate) fn delay_test(
+pub fn delay_test(
     name: &str,
     caption: &str,
-    led: &cellpos_workbench::experiment::identify::led::DelayTest,
+    led: &crate::experiment::identify::led::DelayTest,
 ) -> Figure {
     let first = led.switched_s.first().copied().unwrap_or(0.0);
     let until = led.switched_s.get(4).copied().unwrap_or(first) + 0.006;
@@ -234,7 +238,7 @@ fn sentence(done: &Done) -> (Emphasis, String) {
 }
 
 /// The whole report.
-pub(crate) fn report(done: &Done, rig: &str, command_line: &str, eq6: bool) -> Report {
+pub fn report(done: &Done, rig: &str, command_line: &str, eq6: bool) -> Report {
     let result = &done.result;
     let mut report = Report::new("Identification");
     let points = &result.measured.points;

@@ -1,77 +1,91 @@
-//! `cellpos identify --response`: a base model from a table of frequency and response that somebody else has measured.
+//! A base model from a table of frequency and response that somebody else has measured.
 
-use super::Args;
-use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
+use super::arrays::read_table;
+use super::base::{self, coefficients};
+use cellpos_ident::base::Form;
 use cellpos_ident::from_response::{Measured, ResponseFit, fit_response};
+use cellpos_ident::sampled::Hold;
+use cellpos_numeric::statistics::Z95;
+use cellpos_plant::Model;
 use cellpos_report::number;
+use cellpos_session::Failure;
 use cellpos_table::{ColumnRef, Table};
-use cellpos_workbench::foreign::arrays::read_table;
-use cellpos_workbench::foreign::base::{self, coefficients};
-use cellpos_workbench::foreign::form::Asked;
 use serde_json::json;
 use std::f64::consts::TAU;
 use std::path::Path;
 
-/// Reads, fits, writes.
-pub(super) fn run(args: &Args, path: &Path) -> CommandResult {
+/// A base model of a measured response.
+pub struct OfResponse {
+    /// Points that were fitted.
+    points: Vec<Measured>,
+    fit: ResponseFit,
+    /// The model.
+    pub model: Model,
+}
+
+/// Reads a table and fits a base model to it: of a stated form, or of the simplest that is as good as any up to an order.
+///
+/// # Errors
+/// A table that is no response, and points that no form fits.
+pub fn fit(
+    path: &Path,
+    asked: Option<Form>,
+    most_order: usize,
+    hold: Hold,
+) -> Result<OfResponse, Failure> {
     let points = read(path)?;
-    let asked = args.base.and_then(Asked::form);
-    let fit = fit_response(&points, asked, usize::from(args.order)).map_err(|e| {
+    let fit = fit_response(&points, asked, most_order).map_err(|e| {
         Failure::bad_input(
             format!("{}: {e}", path.display()),
             "check the columns, give more frequencies, or another form in --base",
         )
     })?;
-    let mut model = base::model_of(&fit.model, args.hold.into(), 0.0)?;
+    let mut model = base::model_of(&fit.model, hold, 0.0)?;
     model.description = format!(
         "linear model of order {} from a frequency response",
         fit.form.order
     );
     base::say_form(&mut model, fit.form);
-    if let Some(out) = &args.out {
-        crate::output::write(out, &model.to_toml_string())?;
-    }
-    if args.json {
-        print_json(&to_json(path, &points, &fit))?;
-    } else {
-        print_text(&words(path, &points, &fit))?;
-    }
-    Ok(Outcome::Done)
+    Ok(OfResponse { points, fit, model })
 }
 
-fn words(path: &Path, points: &[Measured], fit: &ResponseFit) -> String {
-    let m = &fit.model;
-    format!(
-        "{}: {} frequencies\nbase model {}: num {}, den {}, {}\n  off by {} % of the response RMS (every second point, predicted from the others: {} %), at most {} dB and {} deg\n",
-        path.display(),
-        points.len(),
-        fit.form,
-        coefficients(&m.numerator, &m.numerator_sd),
-        coefficients(&m.denominator, &m.denominator_sd),
-        match fit.form.delay {
-            true => format!(
-                "delay {} +- {} ms",
-                number(1e3 * m.delay_s),
-                number(1.96e3 * m.delay_sd_s)
-            ),
-            false => "no delay".to_owned(),
-        },
-        number(100.0 * fit.relative_error),
-        number(100.0 * fit.held_out_error),
-        number(fit.worst_db),
-        number(fit.worst_deg),
-    )
-}
+impl OfResponse {
+    /// Messages about it.
+    pub fn words(&self, path: &Path) -> String {
+        let (fit, m) = (&self.fit, &self.fit.model);
+        format!(
+            "{}: {} frequencies\nbase model {}: num {}, den {}, {}\n  off by {} % of the response RMS (every second point, predicted from the others: {} %), at most {} dB and {} deg\n",
+            path.display(),
+            self.points.len(),
+            fit.form,
+            coefficients(&m.numerator, &m.numerator_sd),
+            coefficients(&m.denominator, &m.denominator_sd),
+            match fit.form.delay {
+                true => format!(
+                    "delay {} +- {} ms",
+                    number(1e3 * m.delay_s),
+                    number(1e3 * Z95 * m.delay_sd_s)
+                ),
+                false => "no delay".to_owned(),
+            },
+            number(100.0 * fit.relative_error),
+            number(100.0 * fit.held_out_error),
+            number(fit.worst_db),
+            number(fit.worst_deg),
+        )
+    }
 
-fn to_json(path: &Path, points: &[Measured], fit: &ResponseFit) -> serde_json::Value {
-    let m = &fit.model;
-    json!({ "response": {
-        "file": path, "points": points.len(), "form": fit.form.to_string(), "order": m.order,
-        "num": m.numerator, "den": m.denominator, "delay_ms": 1e3 * m.delay_s,
-        "poles_rad_per_s": m.poles.iter().map(|p| [p.re, p.im]).collect::<Vec<_>>(),
-        "relative_error": fit.relative_error, "held_out_error": fit.held_out_error,
-        "worst_db": fit.worst_db, "worst_deg": fit.worst_deg,
-    } })
+    /// The same as JSON.
+    pub fn to_json(&self, path: &Path) -> serde_json::Value {
+        let (fit, m) = (&self.fit, &self.fit.model);
+        json!({ "response": {
+            "file": path, "points": self.points.len(), "form": fit.form.to_string(), "order": m.order,
+            "num": m.numerator, "den": m.denominator, "delay_ms": 1e3 * m.delay_s,
+            "poles_rad_per_s": m.poles.iter().map(|p| [p.re, p.im]).collect::<Vec<_>>(),
+            "relative_error": fit.relative_error, "held_out_error": fit.held_out_error,
+            "worst_db": fit.worst_db, "worst_deg": fit.worst_deg,
+        } })
+    }
 }
 
 /// The part of a name before its unit, in small letters, and the unit.

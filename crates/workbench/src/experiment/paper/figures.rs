@@ -1,11 +1,11 @@
 //! The paper's figures that `cellpos identify` does not have: 4, 5 and A1.
 
 use super::Drifting;
+use crate::experiment::identify::Done;
 use cellpos_ident::bare_fft;
 use cellpos_ident::excitation::PAPER_FREQUENCIES_HZ;
 use cellpos_numeric::Random;
 use cellpos_report::{Axis, Figure, Panel, Series};
-use cellpos_workbench::experiment::identify::Done;
 
 const TWO_PI: f64 = 2.0 * std::f64::consts::PI;
 /// Sampling time of the paper's computer, s, and of its function generator.
