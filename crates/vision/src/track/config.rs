@@ -55,7 +55,7 @@ pub struct TrackerConfig {
     pub max_amplitude_change: f64,
     /// Largest change of the size, as a fraction of the tracked bead's.
     pub max_size_change: f64,
-    /// Largest residual ratio, in multiples of the tracked bead's (at least of 1).
+    /// Largest residual ratio, in multiples of the tracked bead's (at least of 1), unless the bead is alone in the picture.
     pub max_residual_growth: f64,
     /// How much better (difference of minus twice the log likelihood) one reading of the frame must be than another
     /// before the bead is told from a neighbour.

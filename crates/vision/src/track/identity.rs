@@ -25,17 +25,21 @@ impl Look {
         }
     }
 
-    /// The share of the changes that are allowed by which a fix differs from this.
+    /// The share of the changes of contrast and size that are allowed by which a fix differs from this.
     fn change_used(&self, config: &TrackerConfig, fix: &Fix, size: Option<(f64, f64)>) -> f64 {
         let amplitude = (fix.amplitude / self.amplitude - 1.0).abs() / config.max_amplitude_change;
-        let residual = fix.residual_ratio / (config.max_residual_growth * self.residual.max(1.0));
         let size = match (self.size, size) {
             (Some(own), Some((other, sd))) => {
                 (other / own - 1.0).abs() / (config.max_size_change + SIZE_SIGMA * sd)
             }
             _ => 0.0,
         };
-        amplitude.max(residual).max(size)
+        amplitude.max(size)
+    }
+
+    /// The same of the residual.
+    fn residual_used(&self, config: &TrackerConfig, fix: &Fix) -> f64 {
+        fix.residual_ratio / (config.max_residual_growth * self.residual.max(1.0))
     }
 }
 
@@ -81,10 +85,13 @@ impl Identity {
         fix: &Fix,
         size: Option<(f64, f64)>,
     ) -> f64 {
-        self.mean.change_used(config, fix, size)
+        let residual = self.mean.residual_used(config, fix);
+        self.mean.change_used(config, fix, size).max(residual)
     }
 
-    /// Whether a fix looks as the last one did: a bead that swims over dust changes from frame to frame, and by much in all.
+    /// Whether a fix has the contrast and the size of the last one: a bead that swims over dust changes from frame to frame, and by
+    /// much in all. What dust adds is in the residual, whose limit for a good fix is a share of the contrast: as a multiple of
+    /// the noise it says nothing of which bead this is.
     pub(super) fn goes_on(
         &self,
         config: &TrackerConfig,

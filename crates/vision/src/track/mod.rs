@@ -374,16 +374,18 @@ impl Tracker {
         }
     }
 
-    /// Whether the bead was seen in the frame before, and no other one is in the picture.
+    /// Whether the bead was seen within the coast limit, and no other one is in the picture.
     fn is_alone(&self) -> bool {
         let good = |c: &&Candidate| c.fix.verdict == FixQuality::Good;
-        self.standing.state == TrackState::Tracking
-            && self.neighbours.count() == 0
+        matches!(
+            self.standing.state,
+            TrackState::Tracking | TrackState::Coasting
+        ) && self.neighbours.count() == 0
             && self.candidates.iter().flatten().filter(good).count() == 1
     }
 
-    /// Whether a candidate looks like the bead. One that is alone, where it was a frame ago, and looks as it did then, is ours,
-    /// whatever it swims over.
+    /// Whether a candidate looks like the bead. One that is alone, where the last fix predicts it, and looks as it did then, is ours,
+    /// whatever it swims over: a frame without a fix changes neither.
     fn looks_like(&self, chosen: &Chosen, c: &Candidate, alone: bool) -> bool {
         let goes_on = alone
             && self.within_gate(&chosen.motion, &c.fix)

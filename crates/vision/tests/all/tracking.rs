@@ -19,6 +19,8 @@ struct Scene {
     pixels: Vec<u8>,
     /// Normal numbers, read from a random place on: drawing each one anew would take most of the test's time.
     noise: Vec<f32>,
+    /// A speck of dust: place, contrast, standard deviation.
+    speck: Option<[f64; 4]>,
 }
 
 impl Scene {
@@ -35,6 +37,7 @@ impl Scene {
             image: vec![0.0; WIDTH * HEIGHT],
             pixels: vec![0; WIDTH * HEIGHT],
             noise,
+            speck: None,
         }
     }
 
@@ -43,6 +46,12 @@ impl Scene {
         for (x, y, brightness) in beads {
             self.template
                 .draw(&mut self.image, WIDTH, *x, *y, AMPLITUDE * brightness);
+        }
+        if let Some([x, y, contrast, sd]) = self.speck {
+            for (k, v) in self.image.iter_mut().enumerate() {
+                let (u, w) = ((k % WIDTH) as f64 - x, (k / WIDTH) as f64 - y);
+                *v += (contrast * (-0.5 * (u * u + w * w) / (sd * sd)).exp()) as f32;
+            }
         }
         let start = (random.uniform() * (2 * WIDTH * HEIGHT) as f64) as usize;
         for ((p, v), n) in self
@@ -243,6 +252,47 @@ fn another_kind_of_bead_in_the_lost_ones_place_is_not_taken() {
         }
     }
     assert_eq!(tracker.state(), TrackState::Lost);
+}
+
+#[test]
+fn a_bead_alone_whose_light_fades_is_the_same_after_frames_without_a_fix() {
+    // It fades to 0.4 of its light in 80 frames: far from the mean of its looks, next to the last one.
+    let mut random = Random(7);
+    let mut scene = Scene::new();
+    let mut tracker = tracker();
+    let (mut x, step_px) = (40.0, 0.15);
+    for n in 0..200 {
+        let gap = n > 100 && n % 20 < 4;
+        let brightness = 1.0 - 0.6 * (f64::from(n - 80) / 80.0).clamp(0.0, 1.0);
+        x += step_px * random.normal();
+        let frame = scene.draw(&[(x, 30.0, brightness)], &mut random);
+        let frame = (!gap).then_some(&frame);
+        let t = tracker.step(frame, f64::from(n) * DT_S, (0.0, 0.0));
+        if n > 5 {
+            assert_eq!(t.decision.is_accepted(), !gap, "{n} {t:?}");
+        }
+    }
+}
+
+#[test]
+fn a_bead_alone_is_not_refused_beside_a_speck_of_dust() {
+    // Contrast and size stay as they are, the residual is over four times as large.
+    let mut random = Random(8);
+    let mut scene = Scene::new();
+    scene.speck = Some([45.0, 34.0, -36.0, 1.5]);
+    let mut tracker = tracker();
+    let (mut most, mut x) = (0.0_f64, 60.0);
+    for n in 0..120 {
+        let flow = if n == 100 { -9000.0 } else { 0.0 };
+        x += flow * DT_S;
+        let frame = scene.draw(&[(x, 30.0, 1.0)], &mut random);
+        let t = tracker.step(Some(&frame), f64::from(n) * DT_S, (flow, 0.0));
+        most = most.max(t.fix.residual_ratio);
+        if n > 5 {
+            assert!(t.decision.is_accepted(), "{n} {t:?}");
+        }
+    }
+    assert!(most > 4.0, "{most}");
 }
 
 #[test]
