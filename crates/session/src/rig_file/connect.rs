@@ -169,6 +169,20 @@ impl RigFile {
         })
     }
 
+    /// Lowest and highest position that the picture shows, um. A real camera is opened for this and closed again.
+    ///
+    /// # Errors
+    /// There is no calibration, or the camera cannot be opened.
+    pub fn field_um(&self) -> Result<[f64; 2], Failure> {
+        if let CameraConfig::Emulated {} = self.camera {
+            let half_um = 0.5 * f64::from(self.emulator.width_px) * self.emulator.pixel_um;
+            return Ok([-half_um, half_um]);
+        }
+        let calibration = self.real_calibration()?;
+        let info = self.open_camera()?.info();
+        Ok(calibration.field_um(info.width_px, info.height_px))
+    }
+
     /// The camera of a real rig, running.
     pub fn open_camera(&self) -> Result<Box<dyn Camera>, Failure> {
         match &self.camera {

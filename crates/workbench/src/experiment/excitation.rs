@@ -102,7 +102,8 @@ impl Experiment {
         let setup = rig.bench_setup();
         let expected = setup.expected()?;
         let period_s = setup.sampling().period_s;
-        let limits = |share: f64| rig.limits(8.0 * share, BEAD_UM_PER_S * share, 8.0 * share);
+        let bead_um = rig.bead_amplitude_um(8.0)?;
+        let limits = |share: f64| rig.limits(bead_um * share, BEAD_UM_PER_S * share, 8.0 * share);
         let band = |seconds: f64, seed: u64| {
             let mut plan = Plan::multisine(
                 &BAND_HZ,

@@ -162,6 +162,22 @@ impl OnRig {
         }
     }
 
+    /// The bead's amplitude for an excitation, um: at most `wanted_um`, and half of the way to the nearer border of the picture. A plant of
+    /// twice the model's gain then still keeps the bead in the picture; one of more is measured more gently after a second failure.
+    ///
+    /// # Errors
+    /// Those of [`RigFile::field_um`].
+    pub fn bead_amplitude_um(&self, wanted_um: f64) -> Result<f64, Failure> {
+        let [low_um, high_um] = self.file.field_um()?;
+        let half_um = 0.5 * high_um.min(-low_um);
+        // A target outside the picture has an error of its own, when the bead is to be held there.
+        Ok(if half_um > 0.0 {
+            wanted_um.min(half_um)
+        } else {
+            wanted_um
+        })
+    }
+
     /// Amplitudes that keep the bead in view, its image sharp and the board within its slew.
     pub fn limits(&self, bead_um: f64, bead_um_per_s: f64, pzt_um: f64) -> ShapeLimits {
         // The board follows a step within its first update of 0.1 ms if the slew permits (4 um at 40 um/ms). A larger step would

@@ -1,6 +1,7 @@
 //! The ticks of a run as an evenly sampled record, and the segments in it.
 
 use crate::experiment::exciting::SETTLE_TICKS;
+use cellpos_ident::analogue;
 use cellpos_ident::experiment::{RecordedSegment, Span};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
 
@@ -43,16 +44,17 @@ pub(crate) fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
 
 /// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
 pub(crate) struct Rows {
+    /// Command of each row, um, as if it had been on time.
     pub(crate) input: Vec<f64>,
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
     /// There was no tick at this row: the command before it was held.
     skipped: Vec<bool>,
-    /// The command of this row's tick came late, or never.
+    /// The command of this row's tick came too late to stand as if on time, or never.
     late: Vec<bool>,
     /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
-    /// Age of each row's frame, ns, if it came in time.
+    /// Age that each row's frame has if its command is on time, ns; `None` if it was not.
     ages_ns: Vec<Option<i64>>,
     /// Usual age of a frame at its tick, in rows.
     usual_age_periods: f64,
@@ -76,13 +78,40 @@ fn lateness_ns(ticks: &[TickRecord]) -> Vec<i64> {
     late_ns
 }
 
-/// Lateness from which a command counts as late, ns: a tenth of a period, or more on a machine where too few commands would remain. At
-/// 0.3 of the sampling rate a tenth of a period turns the first image of the held command, the fastest part of a record, by 25 degrees.
+/// Lateness from which a command counts as late, ns: a tenth of a period, or more on a machine where too few commands would remain. A
+/// command can be moved within the band of the rows only: at 0.3 of the sampling rate a tenth of a period turns the first image of the
+/// held command, the fastest part of a record, by 36 degrees.
 fn tolerated_ns(late_ns: &[i64], period_ns: i64) -> i64 {
-    let mut sorted: Vec<i64> = late_ns.iter().map(|ns| ns.saturating_abs()).collect();
+    let known = late_ns.iter().filter(|&&ns| ns != i64::MAX);
+    let mut sorted: Vec<i64> = known.map(|ns| ns.saturating_abs()).collect();
     sorted.sort_unstable();
     let ninth_tenth = sorted.get(sorted.len() * 9 / 10).copied().unwrap_or(0);
-    ninth_tenth.clamp(period_ns / 10, period_ns / 2)
+    ninth_tenth.max(period_ns / 10)
+}
+
+/// Commands that begin with their rows, for commands `held_um` that were handed over `late` rows after that. A command is a step at its
+/// time, and a step between two rows acts within the band of the rows as those that interpolate it.
+fn as_if_on_time(held_um: &[f64], late: &[f64]) -> Vec<f64> {
+    let mut steps_um = vec![0.0; held_um.len()];
+    let first_um = held_um.first().copied().unwrap_or(0.0);
+    let mut before_um = first_um;
+    for (row, (um, late)) in held_um.iter().zip(late).enumerate() {
+        let whole = late.floor();
+        let weights = analogue::weights(late - whole);
+        let begin = row as i64 + whole as i64 + 1 - weights.len() as i64 / 2;
+        for (weight, to) in weights.into_iter().zip(begin..) {
+            // A step before the first row acts in it.
+            if let Some(step_um) = steps_um.get_mut(to.max(0) as usize) {
+                *step_um += weight * (um - before_um);
+            }
+        }
+        before_um = *um;
+    }
+    let sum = |um: &mut f64, step_um: f64| {
+        *um += step_um;
+        Some(*um)
+    };
+    steps_um.into_iter().scan(first_um, sum).collect()
 }
 
 /// Upper limit of the delay from a command to its effect, in periods: at 1 kHz over USB or a serial line, with the lateness of a tick
@@ -147,8 +176,13 @@ impl Rows {
         let usual_ns = median(with_new_frame(&ticks[closed..]).map(age_ns)).unwrap_or(0);
         let late_ns = lateness_ns(&ticks[closed..]);
         let tolerated_ns = tolerated_ns(&late_ns, period_ns);
+        // Counted from the mean, the lateness of what stands as if on time moves the images of the held commands both ways.
+        let in_time = |ns: &&i64| ns.saturating_abs() <= tolerated_ns;
+        let (sum_ns, count) =
+            (late_ns.iter().filter(in_time)).fold((0, 0), |(sum, count), ns| (sum + ns, count + 1));
+        let mean_late_ns = sum_ns / count.max(1);
         rows.usual_age_periods = usual_ns.max(0) as f64 / period_ns as f64;
-        let mut first_id = None;
+        let (mut first_id, mut late_periods) = (None, Vec::new());
         // The clock plays the excitation, so a tick's place in it is its number on the clock's grid.
         let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
         let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
@@ -173,15 +207,23 @@ impl Rows {
                 rows.late.push(true);
                 rows.unseen.push(false);
                 rows.ages_ns.push(None);
+                late_periods.push(0.0);
             }
             let age_ns = age_ns(tick);
             // A frame half a period off the usual age belongs to another row.
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
             let late = late_ns.abs() > tolerated_ns;
+            let late_ns = late_ns.saturating_sub(mean_late_ns);
             rows.skipped[row] = false;
             rows.late[row] = late;
-            rows.ages_ns[row] = (on_time && !late).then_some(age_ns);
+            // No position shows the moment at which a late one acted: for those that are left, it was on time.
+            late_periods[row] = match late {
+                true => 0.0,
+                false => late_ns as f64 / period_ns as f64,
+            };
+            // The row's command stands as if on time.
+            rows.ages_ns[row] = (on_time && !late).then_some(age_ns - late_ns);
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
@@ -192,6 +234,7 @@ impl Rows {
             rows.of_tick.resize(at.max(rows.of_tick.len()), row);
             rows.of_tick.push(row);
         }
+        rows.input = as_if_on_time(&rows.input, &late_periods);
         rows
     }
 

@@ -110,7 +110,7 @@ pub(crate) struct Args {
     /// Frequencies to excite; default: the paper's ten.
     #[arg(long, num_args = 1.., value_delimiter = ',', help_heading = ON_A_RIG)]
     frequency: Vec<Hertz>,
-    /// Largest amplitude of the bead (peak).
+    /// Largest amplitude of the bead (peak); on a rig at most half of the way to the picture's border.
     #[arg(long, default_value = "8um", help_heading = ON_A_RIG)]
     bead_amplitude: Micrometers,
     /// Largest speed of the bead (peak): its image should smear by less than two pixels in an exposure.
@@ -289,7 +289,11 @@ fn job(args: &Args) -> Result<identification::Job, Failure> {
         args.pzt_amplitude.0,
     );
     let limits = match &rig {
-        Some(rig) => rig.limits(amplitudes.0, amplitudes.1, amplitudes.2),
+        Some(rig) => rig.limits(
+            rig.bead_amplitude_um(amplitudes.0)?,
+            amplitudes.1,
+            amplitudes.2,
+        ),
         // As [`on_rig::OnRig::limits`] for the emulated board's 40 um/ms.
         None => ExcitationLimits {
             bead_um: amplitudes.0,

@@ -135,7 +135,7 @@ fn measure(job: &Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Don
     progress("identifying");
     let rig = &job.rig;
     let identification = identify::Job {
-        limits: rig.limits(8.0, 400.0, 10.0),
+        limits: rig.limits(rig.bead_amplitude_um(8.0)?, 400.0, 10.0),
         setup: rig.bench_setup(),
         lines_hz: PAPER_FREQUENCIES_HZ.to_vec(),
         excitation: Excitation::Stepped,
