@@ -10,7 +10,7 @@ use crate::excitation::{ExcitationLimits, Signal, Tone, fold, shaped_amplitude_u
 use crate::frequency_response::{
     DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure,
 };
-use crate::noise::{NoiseModel, apply_noise_model};
+use crate::noise::{NoiseModel, apply_noise_model, velocity_changes};
 pub use crate::segments::{RecordedSegment, Schedule, Span, common_age_s};
 use cellpos_numeric::Random;
 use serde::{Deserialize, Serialize};
@@ -395,6 +395,10 @@ impl Plan {
                 ..*settings
             };
             let mut response = measure(&segment, &settings)?;
+            let velocity_changes = velocity_changes(&response.points, self.period_s);
+            for point in &mut response.points {
+                point.velocity_changes = velocity_changes;
+            }
             if let (Some(age_s), Some(common_s)) = (record.age_s, common_s) {
                 for point in &mut response.points {
                     point.later_s = age_s - common_s;

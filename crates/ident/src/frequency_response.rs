@@ -93,6 +93,8 @@ pub struct FrequencyPoint {
     pub rows: usize,
     /// How much older the frames of this point were at their ticks than those of all points on average, s.
     pub later_s: f64,
+    /// Mean square of the change of the output's velocity from row to row in the segment of this point, (output unit/s)^2.
+    pub velocity_changes: f64,
 }
 
 impl FrequencyPoint {
@@ -313,6 +315,7 @@ fn point(
         block_errors,
         rows,
         later_s: 0.0,
+        velocity_changes: 0.0,
     })
 }
 

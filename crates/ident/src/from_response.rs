@@ -255,6 +255,7 @@ fn weighed(p: &Measured, form: Form) -> FrequencyPoint {
         block_errors: Vec::new(),
         rows: 0,
         later_s: 0.0,
+        velocity_changes: 0.0,
     }
 }
 

@@ -1,11 +1,14 @@
-//! The noise of a bead's position record from the scatter at many lines: Brownian motion plus localisation noise.
+//! The noise of a bead's position record from the scatter at many lines: Brownian motion, localisation noise, and commands that come at
+//! uneven times.
 //!
 //! Increments of a record hold `2 D T` of Brownian motion at every frequency and `s^2 |1 - e^(-jwT)|^2` of localisation
-//! noise. Two numbers fitted to the scatter of all lines have far more degrees of freedom than the scatter of one line,
-//! so the weights are less noisy. If the two numbers do not describe the scatter (another rig, another disturbance),
-//! the scatter is used as measured. Not for finding the cause of such a disturbance.
+//! noise. A command that comes `d` late moves the bead by `d` times the change of its velocity less, for good: with a standard deviation
+//! `t` of that time, increments hold `t^2` times the mean square of that change, which each segment knows of its own bead. Three numbers
+//! fitted to the scatter of all lines have far more degrees of freedom than the scatter of one line, so the weights are less noisy. If
+//! they do not describe the scatter (another rig, another disturbance), the scatter is used as measured. Not for finding the cause of
+//! such a disturbance.
 
-use nalgebra::Complex;
+use nalgebra::{Complex, DMatrix, DVector};
 
 use crate::frequency_response::FrequencyPoint;
 use cellpos_numeric::statistics::{chi2_exceeds, student_t_quantile};
@@ -19,6 +22,8 @@ pub struct NoiseModel {
     pub diffusion_ci95_um2_per_s: f64,
     /// Standard deviation of localisation, um.
     pub localisation_um: f64,
+    /// Standard deviation of the times at which commands act, s; 0 if the lines cannot tell it from Brownian motion: all in one segment.
+    pub timing_s: f64,
     /// Degrees of freedom behind the two numbers.
     pub dof: f64,
     /// Probability of a scatter at least this uneven if the model is correct.
@@ -33,82 +38,205 @@ fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
     (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr()
 }
 
+/// Mean square of the change of the bead's velocity from row to row that `points` of one segment show, (um/s)^2.
+pub(crate) fn velocity_changes(points: &[FrequencyPoint], period_s: f64) -> f64 {
+    let of = |p: &FrequencyPoint| {
+        let x = increment_power(p.frequency_hz, period_s);
+        0.5 * p.output.norm_sqr() * (x / period_s).powi(2)
+    };
+    points.iter().map(of).sum()
+}
+
+/// The scatter of increments at a line, um^2 a row, as it was measured.
+struct Scatter {
+    um2: f64,
+    /// Shares of Brownian motion, localisation noise and timing in it.
+    shares: [f64; 3],
+    dof: f64,
+}
+
+/// Levels of the three kinds of noise, none below 0, and what is known of them.
+struct Levels {
+    levels: [f64; 3],
+    /// Fisher's information on the first level, the others unknown.
+    information: f64,
+    deviance: f64,
+}
+
+/// Sum of the noises in a scatter, um^2 a row.
+fn sum(levels: &[f64; 3], shares: &[f64; 3]) -> f64 {
+    levels.iter().zip(shares).map(|(l, s)| l * s).sum()
+}
+
+/// The likeliest levels of the noises `kinds` (a scatter is gamma-distributed, of variance `2 S^2 / dof`); `None` if the lines do not
+/// tell them apart or a level would be negative.
+fn levels(data: &[Scatter], kinds: &[usize]) -> Option<Levels> {
+    let n = kinds.len();
+    let dof: f64 = data.iter().map(|d| d.dof).sum();
+    let mean = data.iter().map(|d| d.um2 * d.dof).sum::<f64>() / dof;
+    let mut found = Levels {
+        levels: [0.0; 3],
+        information: 0.0,
+        deviance: 0.0,
+    };
+    // Begin where each kind has its share of the mean.
+    for &kind in kinds {
+        let share = data.iter().map(|d| d.shares[kind] * d.dof).sum::<f64>() / dof;
+        found.levels[kind] = mean / (share * n as f64);
+    }
+    let mut information = DMatrix::zeros(n, n);
+    for _ in 0..200 {
+        information.fill(0.0);
+        let mut right = DVector::<f64>::zeros(n);
+        for d in data {
+            let weight = d.dof / (2.0 * sum(&found.levels, &d.shares).powi(2));
+            for (i, &a) in kinds.iter().enumerate() {
+                right[i] += weight * d.shares[a] * d.um2;
+                for (j, &b) in kinds.iter().enumerate() {
+                    information[(i, j)] += weight * d.shares[a] * d.shares[b];
+                }
+            }
+        }
+        let next = information.clone().cholesky()?.solve(&right);
+        // A step that leaves a scatter without variance is taken in part.
+        let mut part = 1.0;
+        let stepped = loop {
+            let mut levels = found.levels;
+            for (i, &kind) in kinds.iter().enumerate() {
+                levels[kind] += part * (next[i] - levels[kind]);
+            }
+            if data.iter().all(|d| sum(&levels, &d.shares) > 0.0) {
+                break levels;
+            }
+            part *= 0.5;
+        };
+        let change = |&kind: &usize| (stepped[kind] / found.levels[kind] - 1.0).abs();
+        let moved: f64 = kinds.iter().map(change).sum();
+        found.levels = stepped;
+        if moved < 1e-9 {
+            break;
+        }
+    }
+    if kinds.iter().any(|&kind| found.levels[kind] < 0.0) {
+        return None;
+    }
+    found.information = 1.0 / information.try_inverse()?[(0, 0)];
+    found.deviance = data
+        .iter()
+        .map(|d| {
+            let r = d.um2 / sum(&found.levels, &d.shares);
+            d.dof * (r - 1.0 - r.ln())
+        })
+        .sum();
+    Some(found)
+}
+
 /// Fits the noise model to the scatter of `points`; if the model holds (p > 0.005), sets their `variance` from it.
 pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option<NoiseModel> {
-    // Per point: scatter of increments per row, the localisation regressor, degrees of freedom.
-    let data: Vec<(f64, f64, f64)> = points
+    let data: Vec<Scatter> = points
         .iter()
         .filter(|p| p.scatter_variance > 0.0 && p.variance_dof >= 2.0)
         .map(|p| {
             let x = increment_power(p.frequency_hz, period_s);
-            let shown = p.scatter_variance * p.input.norm_sqr() * x * p.rows as f64 / 4.0;
-            (shown, x, p.block_errors.len() as f64 * 2.0 - 2.0)
+            Scatter {
+                um2: p.scatter_variance * p.input.norm_sqr() * x * p.rows as f64 / 4.0,
+                shares: [1.0, x, p.velocity_changes],
+                dof: p.block_errors.len() as f64 * 2.0 - 2.0,
+            }
         })
         .collect();
-    let dof: f64 = data.iter().map(|d| d.2).sum();
+    let dof: f64 = data.iter().map(|d| d.dof).sum();
     if data.len() < 3 || dof < 12.0 {
         return None;
     }
-    let mean = data.iter().map(|d| d.0 * d.2).sum::<f64>() / dof;
-    let (mut walk, mut white) = (mean, 0.0);
-    let mut information = 0.0;
-    for _ in 0..200 {
-        // Scoring for gamma-distributed scatter: variance of a scatter is 2 S^2 / dof.
-        let (mut a11, mut a12, mut a22, mut b1, mut b2) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        for &(s, x, v) in &data {
-            let level: f64 = walk + white * x;
-            let weight = v / (2.0 * level * level);
-            a11 += weight;
-            a12 += weight * x;
-            a22 += weight * x * x;
-            b1 += weight * s;
-            b2 += weight * x * s;
-        }
-        let determinant = a11 * a22 - a12 * a12;
-        let (mut w, mut l) = (
-            (b1 * a22 - b2 * a12) / determinant,
-            (a11 * b2 - a12 * b1) / determinant,
-        );
-        if !(w.is_finite() && l.is_finite()) || determinant <= 1e-12 * a11 * a22 || l < 0.0 {
-            (w, l) = (b1 / a11, 0.0);
-        } else if w < 0.0 {
-            (w, l) = (1e-6 * mean, b2 / a22);
-        }
-        let moved = (w - walk).abs() + (l - white).abs();
-        (walk, white) = (w.max(1e-9 * mean), l);
-        information = if l > 0.0 {
-            (a11 * a22 - a12 * a12) / a22
-        } else {
-            a11
-        };
-        if moved < 1e-12 * mean {
-            break;
-        }
-    }
-    let deviance: f64 = data
-        .iter()
-        .map(|&(s, x, v)| {
-            let r = s / (walk + white * x);
-            v * (r - 1.0 - r.ln())
-        })
-        .sum();
-    let p_value = chi2_exceeds(deviance, data.len() as f64 - 2.0);
+    // Lines of one segment saw one timing: the share of Brownian motion again.
+    let most = data.iter().map(|d| d.shares[2]).fold(0.0, f64::max);
+    let apart = data.iter().any(|d| d.shares[2] < 0.99 * most);
+    let kinds: &[&[usize]] = match apart {
+        true => &[&[0], &[0, 1], &[0, 2], &[0, 1, 2]],
+        false => &[&[0], &[0, 1]],
+    };
+    // The likeliest of those without a negative level is that of all levels from 0 on.
+    let found = kinds.iter().filter_map(|kinds| levels(&data, kinds));
+    let found = found.min_by(|a, b| a.deviance.total_cmp(&b.deviance))?;
+    let free = found.levels.iter().filter(|&&level| level > 0.0).count();
+    let p_value = chi2_exceeds(
+        found.deviance,
+        (data.len() - free.min(data.len() - 1)) as f64,
+    );
     let used = p_value > 0.005;
     if used {
         for p in points.iter_mut() {
             let x = increment_power(p.frequency_hz, period_s);
-            p.variance = 4.0 * (walk + white * x) / (p.rows as f64 * x * p.input.norm_sqr());
+            let level = sum(&found.levels, &[1.0, x, p.velocity_changes]);
+            p.variance = 4.0 * level / (p.rows as f64 * x * p.input.norm_sqr());
             p.variance_dof = dof;
         }
     }
+    let [walk, white, timing] = found.levels;
     Some(NoiseModel {
         diffusion_um2_per_s: walk / (2.0 * period_s),
         diffusion_ci95_um2_per_s: student_t_quantile(0.975, dof)
-            / information.sqrt()
+            / found.information.sqrt()
             / (2.0 * period_s),
         localisation_um: white.sqrt(),
+        timing_s: timing.sqrt(),
         dof,
         p_value,
         used,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERIOD_S: f64 = 1e-3;
+
+    /// Lines whose scatter is that of 0.33 um^2/s, fixes of 10 nm and commands that come at times off by 0.2 ms.
+    fn lines(velocity_changes: impl Fn(usize) -> f64) -> Vec<FrequencyPoint> {
+        let point = |(i, frequency_hz): (usize, f64)| {
+            let x = increment_power(frequency_hz, PERIOD_S);
+            let level = 2.0 * 0.33 * PERIOD_S
+                + 0.01f64.powi(2) * x
+                + 0.2e-3f64.powi(2) * velocity_changes(i);
+            let none = Complex::new(0.0, 0.0);
+            FrequencyPoint {
+                frequency_hz,
+                response: none,
+                scatter_variance: 4.0 * level / (1000.0 * x),
+                variance: 1.0,
+                variance_dof: 14.0,
+                coherence: 1.0,
+                input: Complex::new(1.0, 0.0),
+                output: none,
+                block_errors: vec![none; 8],
+                rows: 1000,
+                later_s: 0.0,
+                velocity_changes: velocity_changes(i),
+            }
+        };
+        let hz = [2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0];
+        hz.into_iter().enumerate().map(point).collect()
+    }
+
+    #[test]
+    fn commands_at_uneven_times_are_no_diffusion_where_segments_differ() {
+        let mut apart = lines(|i| 3e3 * (i * i) as f64);
+        let noise = apply_noise_model(&mut apart, PERIOD_S).unwrap();
+        assert!((noise.diffusion_um2_per_s - 0.33).abs() < 1e-3, "{noise:?}");
+        assert!(
+            (noise.timing_s - 0.2e-3).abs() < 1e-6 && noise.used,
+            "{noise:?}"
+        );
+        assert!((noise.localisation_um - 0.01).abs() < 1e-4, "{noise:?}");
+    }
+
+    #[test]
+    fn lines_of_one_segment_leave_uneven_times_in_the_diffusion() {
+        let mut together = lines(|_| 1e4);
+        let noise = apply_noise_model(&mut together, PERIOD_S).unwrap();
+        assert!((noise.diffusion_um2_per_s - 0.53).abs() < 1e-3, "{noise:?}");
+        assert!(noise.timing_s == 0.0, "{noise:?}");
+    }
 }

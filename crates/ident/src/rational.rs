@@ -374,6 +374,7 @@ mod tests {
                     block_errors: Vec::new(),
                     rows: 1000,
                     later_s: 0.0,
+                    velocity_changes: 0.0,
                 }
             })
             .collect()

@@ -291,6 +291,7 @@ pub fn by_reference(
             block_errors: Vec::new(),
             rows,
             later_s: 0.0,
+            velocity_changes: 0.0,
         })
     };
     lines.into_iter().filter_map(|(_, s)| point(s)).collect()

@@ -283,6 +283,16 @@ impl Rows {
                 output[shown - start] = f64::NAN;
             }
         }
+        let steps = output[from - start..].windows(2);
+        let shown = (steps.clone())
+            .filter(|pair| pair.iter().all(|um| um.is_finite()))
+            .count();
+        // The fit leaves out a block that lost half of its steps: with five eighths of all, a quarter of the blocks remain at least.
+        if 8 * shown < 5 * steps.len() {
+            return Err(Spoilt::Thin {
+                lost: 1.0 - shown as f64 / steps.len() as f64,
+            });
+        }
         Ok(RecordedSegment {
             index: span.index,
             from: from - start,
@@ -301,7 +311,7 @@ impl Rows {
 }
 
 /// Why a stretch of a run is not a segment; rows are counted from its start.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Spoilt {
     /// The run ended before it did.
     NotRun,
@@ -317,6 +327,11 @@ pub(crate) enum Spoilt {
         /// Rows without one.
         rows: usize,
     },
+    /// Too few steps from one position to the next are left.
+    Thin {
+        /// Share of them that is missing or shows a late command.
+        lost: f64,
+    },
 }
 
 impl Spoilt {
@@ -329,6 +344,11 @@ impl Spoilt {
             Self::Unseen { at, rows } => {
                 format!("no position for {:.2} s after {:.2} s", s(rows), s(at))
             }
+            Self::Thin { lost } => format!(
+                "{:.0} % of its frames were lost or late, or their commands were: this machine does not keep the loop's time \
+                 (cellpos doctor)",
+                100.0 * lost
+            ),
         }
     }
 }

@@ -40,7 +40,7 @@ fn ticks(frequency_hz: f64, count: i64, late: &Lateness) -> Vec<TickRecord> {
     for k in 0..count {
         let due_ns = k * PERIOD_NS;
         let delay_ns = late.most_ns * spread(k, 0.618_033_988_75).powi(80)
-            + late.often_ns * spread(k, 0.754_877_666_25);
+            + late.often_ns * (43_758.545_3 * (12.989_8 * k as f64).sin()).rem_euclid(1.0);
         if spread(k, 0.414_213_562_37) < late.skipped
             || ticks.last().is_some_and(|last| due_ns < last.time_ns)
         {
@@ -207,4 +207,30 @@ fn frames_that_a_stall_kept_back_are_late_and_not_dropped() {
         (0..200).filter(|&k| missing(k)).collect::<Vec<_>>(),
         [dropped]
     );
+}
+
+#[test]
+fn a_segment_that_lost_half_of_its_steps_is_measured_again_and_one_that_lost_a_tenth_is_not() {
+    let calm = Lateness {
+        most_ns: 0.0,
+        often_ns: 0.0,
+        skipped: 0.0,
+        drift: 0.0,
+    };
+    let span = Span {
+        index: 0,
+        start: 0,
+        settle: 100,
+        rows: 800,
+    };
+    for (every, is_whole) in [(20, true), (4, false)] {
+        let mut ticks = ticks(10.0, 2000, &calm);
+        for tick in ticks.iter_mut().step_by(every) {
+            tick.measured_um = f64::NAN;
+        }
+        let segment = Rows::of(&ticks, PERIOD_NS).segment(&span, 50);
+        assert_eq!(segment.is_ok(), is_whole, "{segment:?}");
+        let why = segment.err().map(|spoilt| spoilt.words(1e-3));
+        assert!(why.is_none_or(|why| why.starts_with("50 % of its frames")));
+    }
 }

@@ -96,6 +96,7 @@ pub fn identification(done: &Done, job: &Job, model: &Path, report: &Path) -> Va
             "diffusion_um2_per_s": n.diffusion_um2_per_s,
             "diffusion_ci95_um2_per_s": n.diffusion_ci95_um2_per_s,
             "localisation_nm": n.localisation_um * 1e3,
+            "timing_ms": n.timing_s * 1e3,
             "p_value": n.p_value,
             "used_for_weights": n.used,
         })),

@@ -274,10 +274,11 @@ pub fn report(done: &Done, rig: &str, command_line: &str, eq6: bool) -> Report {
         .table(parameters(&result.judged.parameters));
     if let Some(noise) = result.measured.noise {
         report.paragraph(&format!(
-            "Noise from the scatter of all lines: diffusion {:.3} +- {:.3} um^2/s, localisation {:.1} nm RMS (p = {:.2}{}).",
+            "Noise from the scatter of all lines: diffusion {:.3} +- {:.3} um^2/s, localisation {:.1} nm RMS, times of the commands {:.3} ms RMS (p = {:.2}{}).",
             noise.diffusion_um2_per_s,
             noise.diffusion_ci95_um2_per_s,
             noise.localisation_um * 1e3,
+            noise.timing_s * 1e3,
             noise.p_value,
             if noise.used { ", used for the weights" } else { ", not used: the scatter of each line weighs it" }
         ));
