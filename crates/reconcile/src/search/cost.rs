@@ -86,26 +86,27 @@ pub(crate) fn leaves_much(null: &Fit, fit: &Fit) -> bool {
         && left > (1.0 - whole(fit)) * left_over(null)
 }
 
-/// A price for a main number outside the range that holds 95 % of the rigs: decides ties between names. It is minus twice the logarithm
-/// of the number's density over that at the end of the range: a normal distribution (of the logarithm, where the range has a lower end
-/// above zero), and a few rigs anywhere. A fit that leaves something over (`left`) is wrong somewhere else, and by how much tells how
-/// little its last percent decides.
+/// A price for a main number outside the range that real rigs show: decides ties between names. A fit that leaves something over
+/// (`left`) is wrong somewhere else, and by how much tells how little its last percent decides.
 pub(crate) fn prior_penalty(part: &Part, left: f64) -> f64 {
     let beyond = beyond(part.variant().typical, part.natural()[0]).min(THRESHOLDS.untypical);
     beyond * (1.0 + THRESHOLDS.untypical_share / THRESHOLDS.untypical * left)
 }
 
-/// Square of a number's distance from the middle of a range that holds 95 %, in standard deviations, less that of the range's end. A
-/// range from zero is that of a size, half a normal distribution.
+/// Price of a number beyond the end of a range, which is known to a tenth: minus twice the logarithm of the probability density, over that
+/// at the end. A number a little beyond it costs next to nothing.
 fn beyond((low, high): (f64, f64), x: f64) -> f64 {
-    const END: f64 = 1.96;
-    let place = match low {
+    const END_SD: f64 = 0.1;
+    let past = match low {
         l if !l.is_finite() => return 0.0,
-        0.0 => x / high,
-        l if l > 0.0 => 2.0 * (x.max(f64::MIN_POSITIVE) / l).ln() / (high / l).ln() - 1.0,
-        l => 2.0 * (x - l) / (high - l) - 1.0,
+        l if l >= 0.0 => {
+            let x = x.max(f64::MIN_POSITIVE);
+            let below = if l > 0.0 { (l / x).ln() } else { 0.0 };
+            (x / high).ln().max(below)
+        }
+        l => 2.0 * (x - l).max(high - x) / (high - l) - 2.0,
     };
-    END * END * (place * place - 1.0).max(0.0)
+    (past.max(0.0) / END_SD).powi(2)
 }
 
 #[cfg(test)]
@@ -114,13 +115,17 @@ mod tests {
 
     #[test]
     fn a_number_a_little_beyond_the_range_of_rigs_costs_a_little() {
-        // A range has no edge at which a name becomes another.
-        assert!(beyond((0.0, 0.06), 0.06).abs() < 1e-9);
-        assert!(beyond((0.0, 0.06), 0.061) < 0.15);
-        assert!((beyond((0.0, 0.06), 0.12) - 3.0 * 3.8416).abs() < 1e-9);
-        assert_eq!(beyond((0.03, 2.0), 0.031), 0.0);
-        assert!((beyond((0.01, 1.0), 10.0) - 3.0 * 3.8416).abs() < 1e-9);
-        assert!((beyond((-1.0, 3.0), -3.0) - 3.0 * 3.8416).abs() < 1e-9);
+        for (range, end, far) in [
+            ((0.0, 0.06), 0.06, 0.06 * f64::exp(0.3)),
+            ((0.01, 1.0), 1.0, f64::exp(0.3)),
+            ((0.01, 1.0), 0.01, 0.01 * f64::exp(-0.3)),
+            ((-1.0, 3.0), -1.0, -1.6),
+            ((-1.0, 3.0), 3.0, 3.6),
+        ] {
+            assert_eq!(beyond(range, end), 0.0, "{range:?}");
+            assert!(beyond(range, end + 0.01 * (far - end)) < 0.01, "{range:?}");
+            assert!((beyond(range, far) - 9.0).abs() < 1e-6, "{range:?}");
+        }
         assert_eq!(beyond((f64::NEG_INFINITY, f64::INFINITY), 1e9), 0.0);
     }
 }
