@@ -396,7 +396,7 @@ mod tests {
         assert!((mean[0] - 3.2).abs() < 1e-12 && (mean[1] - 2.9).abs() < 1e-12);
         // Values 0.4 and 0.2 apart: a variance of (0.08 + 0.02) / 2, the mean's is half of it, times t of one degree of freedom. It is
         // the same where two cells happen to meet.
-        let half = 12.706 * 0.025_f64.sqrt();
+        let half = 12.706_204_736_175 * 0.025_f64.sqrt();
         for k in [0, 1] {
             assert!(
                 (high[k] - mean[k] - half).abs() < 1e-9 && (mean[k] - low[k] - half).abs() < 1e-9
