@@ -15,9 +15,9 @@ const LAST: usize = 1000;
 /// Rows that one number needs: the regression takes the share of a number from the noise, known to its own error only.
 const ROWS_A_NUMBER: usize = 10;
 
-/// How many rows ago each block of the command begins, and its length. The command of a frame's own row may follow from that frame.
+/// First row and length of the blocks of the command.
 fn blocks() -> Vec<(usize, usize)> {
-    let mut blocks: Vec<(usize, usize)> = (1..SINGLE).map(|lag| (lag, 1)).collect();
+    let mut blocks: Vec<(usize, usize)> = (0..SINGLE).map(|lag| (lag, 1)).collect();
     let mut lag = SINGLE;
     while lag < LAST {
         let rows = lag / 4;
@@ -98,7 +98,7 @@ mod tests {
     use super::*;
     use cellpos_numeric::Random;
 
-    /// A bead in a loop whose command follows from each frame and acts three rows later, with a gain that the model does not have: the residual beside a model of
+    /// A bead in a loop that follows its noise, two rows late, with a gain that the model does not have: the residual beside a model of
     /// gain 0.4 a row.
     fn closed(rows: usize, gain: f64, seed: u64) -> (Vec<f64>, Vec<f64>) {
         let mut random = Random::new(seed);
@@ -112,7 +112,7 @@ mod tests {
             e.push(seen - model);
             u.push(0.2 * (0.03 * (k * k % 5000) as f64).sin() - 0.6 * seen);
         }
-        (u[3..].to_vec(), e)
+        (u[2..].to_vec(), e)
     }
 
     #[test]
