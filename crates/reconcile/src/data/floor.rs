@@ -1,9 +1,8 @@
 //! The noise floor, from the records or from what is stated, before any model is believed; or the statement that it is not
 //! known.
 
-use crate::data::cleaned::{increment_moments, without_jumps, without_lines};
+use crate::data::cleaned::{without_jumps, without_lines};
 use crate::data::coloured::{Alone, NoiseKind, choose};
-use crate::data::no_response::without_response;
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
 use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
@@ -24,8 +23,6 @@ pub enum FloorSource {
     EqualRecords,
     /// The noise that the model states.
     Stated,
-    /// What no linear response to the command explains.
-    Innovations,
     /// Nowhere: nothing rests or repeats, and nothing is stated. The figures are then the fit's own residual.
     Unknown,
 }
@@ -39,9 +36,6 @@ impl FloorSource {
             Self::EqualRecords => "measured between records of the same command",
             Self::Stated => {
                 "stated in the model: no record has a rest of the command or repeats it for long enough"
-            }
-            Self::Innovations => {
-                "measured as what no linear response to the command explains: nothing rests or repeats for long enough"
             }
             Self::Unknown => {
                 "not known: no rest of the command, no repeated command, no stated noise"
@@ -122,8 +116,8 @@ pub(crate) fn error_of(rows: usize) -> f64 {
 /// repeats, the difference of successive periods cancels every response that repeats, and so does the difference of two
 /// records of the same command. The one that is surely smallest rules, with those that differ from it by chance: a misfit can only
 /// add, and the smallest of several that are known badly is too small. Without any, what the model states is
-/// taken, as long as the records do not lie below it; and without that, of a bead, what no linear response to the command explains. Else
-/// the floor is not known, and the increments of the residuals stand in for the figures alone.
+/// taken, as long as the records do not lie below it; and without that, the floor is not known, and the increments of the
+/// residuals stand in for the figures alone.
 pub(crate) fn estimate(
     records: &[Record],
     present: &[Vec<bool>],
@@ -132,8 +126,21 @@ pub(crate) fn estimate(
     kind: NoiseKind,
 ) -> Floor {
     let mut found = of_records(records, present, residuals);
+    let own: Vec<Estimate> = (residuals.iter().zip(present))
+        .map(|(e, present)| {
+            let (c0, c1, rows) = increment_moments(e, present);
+            Estimate {
+                c0,
+                c1,
+                rows,
+                independent: 1.0,
+                source: FloorSource::Unknown,
+                alone: (e.clone(), present.clone()),
+                share: 1.0,
+            }
+        })
+        .collect();
     let quantum_um2 = quantisation_um2(records);
-    let walks = kind == NoiseKind::Walk && quantum_um2 == 0.0;
     // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
     let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
     let kind = if unasked { NoiseKind::Walk } else { kind };
@@ -151,8 +158,7 @@ pub(crate) fn estimate(
             rows: pooled.rows,
         };
     }
-    let own: Vec<Estimate> = (residuals.iter().zip(present))
-        .map(|(e, present)| of_increments(e, present))
+    let own: Vec<Estimate> = (own.into_iter())
         .filter(|f| f.rows >= 20 && f.c0 > 0.0)
         .collect();
     let residual = own
@@ -165,28 +171,24 @@ pub(crate) fn estimate(
             choose(kind, walk, &least.alone()).at_least(quantum_um2)
         });
     let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
-    let above = |noise: &NoiseModel, least: NoiseModel| {
-        noise.innovation_um() >= (1.0 + THRESHOLDS.stated_excess) * least.innovation_um()
-    };
-    if let (Some(noise), Some(least)) = (stated, residual)
-        && !above(&noise, least)
-    {
-        return Floor {
-            noise: NoiseModel {
-                white_um2: noise.white_um2.max(quantum_um2),
-                ..noise
-            },
-            source: FloorSource::Stated,
+    match (stated, residual) {
+        (Some(noise), Some(least))
+            if noise.innovation_um() < (1.0 + THRESHOLDS.stated_excess) * least.innovation_um() =>
+        {
+            Floor {
+                noise: NoiseModel {
+                    white_um2: noise.white_um2.max(quantum_um2),
+                    ..noise
+                },
+                source: FloorSource::Stated,
+                rows: 0,
+            }
+        }
+        (_, least) => Floor {
+            noise: least.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
+            source: FloorSource::Unknown,
             rows: 0,
-        };
-    }
-    if walks && let Some(floor) = of_moving(records, present, residuals) {
-        return floor;
-    }
-    Floor {
-        noise: residual.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
-        source: FloorSource::Unknown,
-        rows: 0,
+        },
     }
 }
 
@@ -309,47 +311,6 @@ fn between_periods(r: &Record, e: &[f64], present: &[bool], repeats: &Repeats) -
         .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
 }
 
-/// The increments of residuals as they are.
-fn of_increments(e: &[f64], present: &[bool]) -> Estimate {
-    let (c0, c1, rows) = increment_moments(e, present);
-    Estimate {
-        c0,
-        c1,
-        rows,
-        independent: 1.0,
-        source: FloorSource::Unknown,
-        alone: (e.to_vec(), present.to_vec()),
-        share: 1.0,
-    }
-}
-
-/// What moving records of a bead tell of the noise: what no linear response to the command explains.
-fn of_moving(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Option<Floor> {
-    /// Rounds in which noise and response settle: each leaves a part of the last one's error that is as small as the response's share.
-    const ROUNDS: usize = 3;
-    let mut found: Vec<Estimate> = Vec::new();
-    for ((r, e), ok) in records.iter().zip(residuals).zip(present) {
-        let source = FloorSource::Innovations;
-        let mut own = of_increments(e, ok);
-        for _ in 0..ROUNDS {
-            let noise = NoiseModel::from_increments(own.c0, own.c1);
-            let Some((clean, fitted)) = without_response(&r.pzt_um, e, ok, &noise) else {
-                break;
-            };
-            let share = own.rows as f64 / (own.rows as f64 - fitted as f64).max(1.0);
-            own = of(&clean, ok, r.sample_s, source, share);
-        }
-        found.extend((own.source == source && own.counts()).then_some(own));
-    }
-    let least = (found.iter()).min_by(|a, b| a.most().total_cmp(&b.most()))?;
-    let all = pooled(&found, least);
-    Some(Floor {
-        noise: NoiseModel::from_increments(all.c0, all.c1),
-        source: FloorSource::Innovations,
-        rows: all.rows,
-    })
-}
-
 /// Those that differ from the least by chance together.
 fn pooled(of: &[Estimate], least: &Estimate) -> Estimate {
     let by_chance = |f: &&Estimate| {
@@ -407,6 +368,37 @@ pub(crate) fn refined(noise: &NoiseModel, unlikelihood: impl Fn(&NoiseModel) -> 
     let share = ((noise.white_um2 / variance - LEAST) / RANGE).clamp(1e-3, 1.0 - 1e-3);
     let begun = [variance.ln(), (share / (1.0 - share)).ln()];
     of(descend(begun, 2e-3, |x| unlikelihood(&of(x))))
+}
+
+/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
+pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
+    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
+    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
+    for k in 1..r.len() {
+        if valid(k) {
+            mean += r[k] - r[k - 1];
+            n0 += 1;
+        }
+    }
+    if n0 == 0 {
+        return (0.0, 0.0, 0);
+    }
+    mean /= n0 as f64;
+    for k in 1..r.len() {
+        if valid(k) {
+            let d = r[k] - r[k - 1] - mean;
+            c0 += d * d;
+            if valid(k - 1) {
+                c1 += d * (r[k - 1] - r[k - 2] - mean);
+                n1 += 1;
+            }
+        }
+    }
+    (
+        c0 / n0 as f64,
+        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
+        n0,
+    )
 }
 
 #[cfg(test)]
