@@ -189,9 +189,7 @@ impl Retuning {
             let [longer, shorter] = found.delay_odds(DELAYS[member], HALF_STEP);
             longer.max(shorter) > sure
         };
-        // Not on the way from one to another: a report names where the delay came to rest.
-        let rests = found.delay_sd < HALF_STEP && !surely_not(self.member, DELAY_SURE);
-        let delay = rests && surely_not(before.member, REPORT_SURE);
+        let delay = surely_not(before.member, REPORT_SURE) && !surely_not(self.member, DELAY_SURE);
         if !(gain || delay) {
             return None;
         }
