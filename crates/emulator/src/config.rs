@@ -347,7 +347,7 @@ impl WorldConfig {
     }
 
     /// Half of the frame's width, um.
-    pub(crate) fn half_frame_um(&self) -> f64 {
+    pub fn half_frame_um(&self) -> f64 {
         0.5 * f64::from(self.width_px) * self.pixel_um
     }
 

@@ -1,7 +1,7 @@
 //! An analogue input that was sampled with the output: what it did between its samples.
 
 /// Samples on each side from which a value between two samples is made.
-pub const SIDE: usize = 8;
+const SIDE: usize = 8;
 
 /// Weights of the samples around a place `at` between two of them, in parts of their distance from the first: a sinc under a Hann window.
 /// Half of the samples lie on each side.

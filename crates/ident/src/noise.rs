@@ -98,18 +98,16 @@ fn levels(data: &[Scatter], kinds: &[usize]) -> Option<Levels> {
             }
         }
         let next = information.clone().cholesky()?.solve(&right);
-        // A step that leaves a scatter without variance is taken in part.
-        let mut part = 1.0;
-        let stepped = loop {
+        // A step that leaves a scatter without variance is taken in part. No part of one that is no number will do.
+        let in_part = |halvings: i32| {
             let mut levels = found.levels;
             for (i, &kind) in kinds.iter().enumerate() {
-                levels[kind] += part * (next[i] - levels[kind]);
+                levels[kind] += 0.5_f64.powi(halvings) * (next[i] - levels[kind]);
             }
-            if data.iter().all(|d| sum(&levels, &d.shares) > 0.0) {
-                break levels;
-            }
-            part *= 0.5;
+            let all_vary = data.iter().all(|d| sum(&levels, &d.shares) > 0.0);
+            all_vary.then_some(levels)
         };
+        let stepped = (0..52).find_map(in_part)?;
         let change = |&kind: &usize| (stepped[kind] / found.levels[kind] - 1.0).abs();
         let moved: f64 = kinds.iter().map(change).sum();
         found.levels = stepped;

@@ -175,7 +175,7 @@ impl RigFile {
     /// There is no calibration, or the camera cannot be opened.
     pub fn field_um(&self) -> Result<[f64; 2], Failure> {
         if let CameraConfig::Emulated {} = self.camera {
-            let half_um = 0.5 * f64::from(self.emulator.width_px) * self.emulator.pixel_um;
+            let half_um = self.emulator.half_frame_um();
             return Ok([-half_um, half_um]);
         }
         let calibration = self.real_calibration()?;
