@@ -67,11 +67,11 @@ impl Reach {
         }
     }
 
-    /// The nearest to `wanted` after `last`.
+    /// The nearest to `wanted` after `last`. Never panics, whatever the numbers are.
     pub(crate) fn clamp(&self, wanted: f64, last: f64) -> f64 {
-        wanted
-            .clamp(last - self.move_um, last + self.move_um)
-            .clamp(self.low_um, self.high_um)
+        (wanted.max(last - self.move_um).min(last + self.move_um))
+            .max(self.low_um)
+            .min(self.high_um)
     }
 }
 

@@ -4,6 +4,7 @@
 //! displacement at which the bead rests. Every plant of Eq. (4) has this form once its slowest pole (587 s in Eq. (6))
 //! counts as an integrator: the drift state takes up the difference.
 
+use crate::deviation::Deviation;
 use crate::error::{BuildError, check};
 
 /// Modes besides the integrator that the estimator holds.
@@ -84,13 +85,14 @@ impl LoopModel {
             ts_ok,
             "positive, at most 1 s",
         )?;
-        let gain_ok = self.gain_per_s != 0.0 && self.gain_per_s.abs() * self.sample_time_s < 1e3;
+        let gain_ok = self.gain_per_s.abs() >= LEAST_GAIN_PER_S
+            && self.gain_per_s.abs() * self.sample_time_s < 1e3;
         check(
             "gain_per_s",
             "1/s",
             self.gain_per_s,
             gain_ok,
-            "not zero (Eq. (6) has 428/s)",
+            "at least 1e-6 per s, and less than 1000 um of bead for 1 um in a sample (Eq. (6) has 428/s)",
         )?;
         check(
             "feedthrough",
@@ -115,9 +117,22 @@ impl LoopModel {
                 p < 0.0 || (p == 0.0 && mode.residue_per_s == 0.0),
                 "negative",
             )?;
-            check("residue_per_s", "1/s", mode.residue_per_s, true, "finite")?;
+            check(
+                "residue_per_s",
+                "1/s",
+                mode.residue_per_s,
+                mode.residue_per_s.abs() * self.sample_time_s < MOST_RESIDUE_UM,
+                "less than 1e9 um of bead for 1 um in a sample",
+            )?;
         }
-        Ok(())
+        let moved_um = Deviation::new(self).moved_um();
+        check(
+            "motion of the bead one sample after 1 um of command",
+            "um",
+            moved_um,
+            moved_um.abs() >= LEAST_MOTION_UM,
+            "at least 1e-12 um, or no command follows a reference",
+        )
     }
 
     /// Delay in samples, fractional.
@@ -139,6 +154,13 @@ impl LoopModel {
     }
 }
 
+/// Gain below which no stroke moves a bead, 1/s: 1 m of stroke for 1 um/s.
+const LEAST_GAIN_PER_S: f64 = 1e-6;
+/// Motion by one mode in a sample for 1 um of command, um. Two poles that lie close together have large residues of opposite signs; beyond
+/// this, rounding is all that is left of their difference.
+const MOST_RESIDUE_UM: f64 = 1e9;
+/// Motion in a sample below which its inverse is rounding, um for 1 um of command.
+const LEAST_MOTION_UM: f64 = 1e-12;
 /// Poles slower than this count as integrators, rad/s: the drift state takes up what they lack.
 const SLOWEST_RAD_PER_S: f64 = 0.5;
 

@@ -107,10 +107,12 @@ fn usr1_pauses_and_goes_on_and_ctrl_z_does_not_stop_a_program_that_holds_a_bead(
 fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
     for ignored in [true, false] {
         let folder = tempfile::tempdir().unwrap();
-        let trap = if ignored { "trap '' HUP; " } else { "" };
-        let line = format!("{trap}exec {} {TRACK}", env!("CARGO_BIN_EXE_cellpos"));
-        let mut child = Command::new("sh")
-            .args(["-c", &line])
+        // Said in both cases: the tests themselves may run under `nohup`.
+        let hang_up = if ignored { "ignore" } else { "default" };
+        let mut child = Command::new("env")
+            .arg(format!("--{hang_up}-signal=HUP"))
+            .arg(env!("CARGO_BIN_EXE_cellpos"))
+            .args(TRACK.split_whitespace())
             .current_dir(folder.path())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

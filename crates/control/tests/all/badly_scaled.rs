@@ -1,8 +1,8 @@
 //! A design of whatever a model file may hold comes to an end: with figures, or with a sentence.
 
 use cellpos_control::design::{
-    DesignLimits, DesignPlant, DesignReport, DesignRequest, PiSearch, Requested, default_lead,
-    design,
+    DesignLimits, DesignPlant, DesignReport, DesignRequest, DesignWarning, PiSearch, Requested,
+    default_lead, design,
 };
 use cellpos_control::{ControllerConfig, Limits, Lqg, Mpc, Pi};
 use cellpos_plant::TransferFunction;
@@ -47,7 +47,7 @@ fn any_law() -> impl Strategy<Value = Requested> {
     ]
 }
 
-/// A design on a thread of its own; nothing where it does not end.
+/// A design on a thread of its own; nothing where it does not end, or panics.
 fn ends(request: DesignRequest) -> Option<Result<DesignReport, String>> {
     let (done, result) = channel();
     std::thread::spawn(move || {
@@ -68,7 +68,7 @@ fn request(plant: DesignPlant, controller: Requested) -> DesignRequest {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
 
     #[test]
     fn a_badly_scaled_model_ends_in_a_design_or_a_sentence(
@@ -98,7 +98,7 @@ proptest! {
             ..DesignPlant::eq6(2.5e-3)
         };
         let ended = ends(request(plant, controller));
-        prop_assert!(ended.is_some(), "does not end: {num:?} / {den:?}, {delay_s} s at {sample_time_s} s");
+        prop_assert!(ended.is_some(), "panics or does not end: {num:?} / {den:?}, {delay_s} s at {sample_time_s} s");
         if let Some(Err(sentence)) = ended {
             prop_assert!(sentence.len() > 20, "{sentence:?}");
         }
@@ -116,6 +116,29 @@ fn poles_that_rounding_tears_apart_end_in_a_design_or_a_sentence() {
         Requested::Given(ControllerConfig::Lqg(Lqg::default())),
     ));
     assert!(ended.is_some());
+}
+
+#[test]
+fn a_gain_that_no_stroke_can_use_gets_no_loop_and_its_value_is_named() {
+    let pi = Pi::new(1.0, 1.0);
+    for (num, den) in [
+        (vec![1.0, 1.0], vec![1e300, 1.0]),
+        (vec![1e-9], vec![1.0, 0.0]),
+    ] {
+        let plant = DesignPlant {
+            plant: TransferFunction::new(num, den).unwrap(),
+            ..DesignPlant::eq6(2.5e-3)
+        };
+        let report = ends(request(plant, Requested::Given(ControllerConfig::Pi(pi))))
+            .expect("it ends")
+            .expect("margins");
+        assert!(report.config.is_none(), "no loop runs with it");
+        assert!(
+            matches!(&report.warnings[..], [DesignWarning::NoLoop(error), ..] if error.to_string().contains("gain_per_s")),
+            "{:?}",
+            report.warnings
+        );
+    }
 }
 
 #[test]
