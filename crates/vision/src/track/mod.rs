@@ -333,13 +333,6 @@ impl Tracker {
             Some(Claim::Ours) => best,
             _ => None,
         };
-        let taken_fix = taken.and_then(|k| Some(self.candidates.get(k)?.as_ref()?.fix));
-        if let Some(fix) = taken_fix
-            && chosen.motion.has_stepped(&fix)
-        {
-            let motion = chosen.motion;
-            (self.neighbours).carry(motion.way_to(&fix), motion.since_s());
-        }
         self.neighbours.update(
             &chosen.motion,
             &self.candidates,

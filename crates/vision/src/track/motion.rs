@@ -37,6 +37,14 @@ impl Randomness {
             flow_error: config.flow_error,
         }
     }
+
+    /// Of the way between two beads: both walk, and a flow carries both.
+    pub(super) fn between(&self) -> Self {
+        Randomness {
+            diffusion_px2_per_s: 2.0 * self.diffusion_px2_per_s,
+            ..*self
+        }
+    }
 }
 
 /// Time in which what was learnt of the commanded flow is forgotten, s: a few frames of a piezo in motion teach it anew.
@@ -57,11 +65,6 @@ struct Axis {
     ee: f64,
     /// Commanded flow of the frame before, px/s.
     flow: f64,
-    /// Parts of pp, pv and vv that are of the flow and not of this bead alone: what is not known of the commanded one, and of one that
-    /// has stepped.
-    flow_pp: f64,
-    flow_pv: f64,
-    flow_vv: f64,
 }
 
 impl Axis {
@@ -77,9 +80,6 @@ impl Axis {
             ve: 0.0,
             ee: 0.0,
             flow: 0.0,
-            flow_pp: 0.0,
-            flow_pv: 0.0,
-            flow_vv: 0.0,
         }
     }
 
@@ -98,8 +98,6 @@ impl Axis {
             way * (2.0 * self.pe + 2.0 * dt_s * self.ve + way * self.ee) + half * change * change;
         self.pp +=
             dt_s * (2.0 * self.pv + dt_s * self.vv) + 2.0 * r.diffusion_px2_per_s * dt_s + wrong;
-        self.flow_pp += dt_s * (2.0 * self.flow_pv + dt_s * self.flow_vv) + wrong.max(0.0);
-        self.flow_pv += dt_s * self.flow_vv;
         self.pv += dt_s * self.vv + way * self.ve;
         self.pe += dt_s * self.ve + way * self.ee;
         self.vv += r.velocity_walk * r.velocity_walk * dt_s;
@@ -112,9 +110,6 @@ impl Axis {
         self.pp += way2;
         self.pv += way * speed;
         self.vv += 2.0 * speed * speed;
-        self.flow_pp += way2;
-        self.flow_pv += way * speed;
-        self.flow_vv += 2.0 * speed * speed;
     }
 
     fn update(&mut self, innovation: f64, fix_var: f64) {
@@ -123,41 +118,17 @@ impl Axis {
         self.p += kp * innovation;
         self.v += kv * innovation;
         self.e += ke * innovation;
-        let vv = self.vv;
         self.vv -= kv * self.pv;
         self.ve -= kv * self.pe;
         self.ee -= ke * self.pe;
         self.pv *= 1.0 - kp;
         self.pe *= 1.0 - kp;
         self.pp *= 1.0 - kp;
-        (self.flow_pp, self.flow_pv) = (0.0, 0.0);
-        self.flow_vv *= (self.vv / vv).clamp(0.0, 1.0);
     }
 
-    /// Covariance with another bead in the same flow.
-    fn shared(&self, other: &Self) -> f64 {
-        let most = self.flow_pp.min(other.flow_pp);
-        most.min(self.pp).min(other.pp).max(0.0)
-    }
-
-    /// The same, now that another bead in the same flow was found `innovation` from its prediction.
-    fn given(&self, other: &Self, innovation: f64, fix_var: f64) -> Self {
-        let shared = self.shared(other);
-        let share = shared / (other.pp + fix_var);
-        Axis {
-            p: self.p + share * innovation,
-            pp: self.pp - share * shared,
-            ..*self
-        }
-    }
-
-    /// The same if the flow has stepped: it has carried both alike.
-    fn carried_with(&self, other: &Self, way: f64, fix_var: f64) -> Self {
-        Axis {
-            p: self.p + way,
-            pp: self.pp + other.pp - 2.0 * self.shared(other) + fix_var,
-            ..*self
-        }
+    /// A place that is known with this variance.
+    fn at(self, p: f64, pp: f64) -> Self {
+        Axis { p, pp, ..self }
     }
 }
 
@@ -273,23 +244,23 @@ impl Motion {
         self.since_s = 0.0;
     }
 
-    /// The motion as it is predicted when a fix was of another bead in the same quiet flow: what is not known of the flow moves both.
-    pub(super) fn given(&self, other: &Self, fix: &Fix) -> Self {
-        let ((x, y), (rx, ry)) = (other.way_to(fix), variances(fix));
+    /// The motion of a bead that moves like `of` and is where this fix is.
+    pub(super) fn at(fix: &Fix, of: &Self) -> Self {
+        let (rx, ry) = variances(fix);
         Motion {
-            x: self.x.given(&other.x, x, rx),
-            y: self.y.given(&other.y, y, ry),
-            ..*self
+            x: of.x.at(fix.x_px, rx),
+            y: of.y.at(fix.y_px, ry),
+            ..*of
         }
     }
 
-    /// The same when the flow has stepped and carried the other bead to its fix.
-    pub(super) fn carried_with(&self, other: &Self, fix: &Fix) -> Self {
-        let ((x, y), (rx, ry)) = (other.way_to(fix), variances(fix));
+    /// The same with a way to another bead added, as far as its place goes.
+    pub(super) fn plus(&self, way: &Self) -> Self {
+        let sum = |a: Axis, b: &Axis| a.at(a.p + b.p, a.pp + b.pp);
         Motion {
-            x: self.x.carried_with(&other.x, x, rx),
-            y: self.y.carried_with(&other.y, y, ry),
-            ..*self
+            x: sum(self.x, &way.x),
+            y: sum(self.y, &way.y),
+            since_s: self.since_s,
         }
     }
 }

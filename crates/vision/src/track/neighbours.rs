@@ -45,9 +45,22 @@ fn is_sight(fix: &Fix) -> bool {
     matches!(fix.verdict, FixQuality::Good | FixQuality::AtBorder) && fix.amplitude != 0.0
 }
 
+/// The way from one bead to another as a fix.
+fn between(from: &Fix, to: &Fix) -> Fix {
+    Fix {
+        x_px: to.x_px - from.x_px,
+        y_px: to.y_px - from.y_px,
+        var_x_px2: to.var_x_px2 + from.var_x_px2,
+        var_y_px2: to.var_y_px2 + from.var_y_px2,
+        ..*to
+    }
+}
+
 #[derive(Debug, Clone, Copy)]
 struct Neighbour {
     motion: Motion,
+    /// From the chosen bead to it. A flow, however it steps, carries both.
+    apart: Motion,
     amplitude: f64,
     seen_s: f64,
     /// Frames in which it was seen.
@@ -58,6 +71,21 @@ impl Neighbour {
     /// Whether it has been seen as often as a bead is before it is followed. What has not may be a fit gone astray.
     fn is_confirmed(&self, config: &TrackerConfig) -> bool {
         self.sights >= config.confirm_frames
+    }
+
+    /// Its motion where the chosen bead is as `ours` says: whichever is known better, its own or the way between them.
+    fn beside(&self, ours: &Motion) -> Motion {
+        let carried = self.carried_with(ours);
+        if carried.sd_px() < self.motion.sd_px() {
+            carried
+        } else {
+            self.motion
+        }
+    }
+
+    /// The same by the way between them alone: a flow that steps carries both.
+    fn carried_with(&self, ours: &Motion) -> Motion {
+        ours.plus(&self.apart)
     }
 }
 
@@ -70,10 +98,10 @@ pub(crate) struct Neighbours {
 type Candidates = [Option<Candidate>; MAX_BEADS];
 
 impl Neighbours {
-    /// Predicted positions (px) and amplitudes (grey levels) of the neighbours.
-    pub(super) fn predictions(&self) -> impl Iterator<Item = (f64, f64, f64)> {
+    /// Predicted positions (px) and amplitudes (grey levels) of the neighbours of a bead that moves as `ours`.
+    pub(super) fn predictions(&self, ours: &Motion) -> impl Iterator<Item = (f64, f64, f64)> {
         self.beads.iter().flatten().map(|n| {
-            let (x, y) = n.motion.position();
+            let (x, y) = n.beside(ours).position();
             (x, y, n.amplitude)
         })
     }
@@ -88,8 +116,10 @@ impl Neighbours {
         flow_px_per_s: (f64, f64),
         randomness: &Randomness,
     ) {
+        let between = randomness.between();
         for n in self.beads.iter_mut().flatten() {
             n.motion.predict(dt_s, flow_px_per_s, randomness);
+            n.apart.predict(dt_s, (0.0, 0.0), &between);
         }
     }
 
@@ -127,19 +157,16 @@ impl Neighbours {
         }
     }
 
-    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden. A flow carries all beads alike: the others are
-    /// looked for where they go with the chosen one, in a flow that is quiet and in one that has stepped.
+    /// Cost of the reading in which the chosen bead is the candidate `own`, or hidden, in a flow that is quiet or has stepped.
     pub(super) fn cost(&self, ours: &Motion, candidates: &Candidates, own: Option<usize>) -> f64 {
         let own_fix = own.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
         let Some(fix) = own_fix else {
-            return MISS + self.cost_of_others(candidates, None, |n| n.motion);
+            return MISS + self.cost_of_others(candidates, None, |n| n.beside(ours));
         };
-        let others = |motion: &dyn Fn(&Neighbour) -> Motion| {
-            self.cost_of_others(candidates, own, |n| motion(n))
-        };
-        let quiet = ours.quiet_cost(&fix) + others(&|n| n.motion.given(ours, &fix));
-        let stepped = ours.step_cost(&fix) + others(&|n| n.motion.carried_with(ours, &fix));
-        quiet.min(stepped)
+        let there = Motion::at(&fix, ours);
+        let quiet = self.cost_of_others(candidates, own, |n| n.beside(&there));
+        let stepped = self.cost_of_others(candidates, own, |n| n.carried_with(&there));
+        (ours.quiet_cost(&fix) + quiet).min(ours.step_cost(&fix) + stepped)
     }
 
     /// Cost of the other beads, with their motion, and of unknown beads.
@@ -192,17 +219,6 @@ impl Neighbours {
         (sights, cost)
     }
 
-    /// Goes along with a step of the flow that has carried the chosen bead this far in `since_s`: each as far as it went at that speed
-    /// since it was seen itself.
-    pub(super) fn carry(&mut self, (x_px, y_px): (f64, f64), since_s: f64) {
-        for n in self.beads.iter_mut().flatten() {
-            let share = n.motion.since_s() / since_s;
-            if share.is_finite() {
-                n.motion.carry((share * x_px, share * y_px));
-            }
-        }
-    }
-
     /// Takes in the other beads seen with the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
     /// not seen, a candidate that it could be does not count as a sight of a neighbour.
     pub(super) fn update(
@@ -215,9 +231,17 @@ impl Neighbours {
         (width, height): (usize, usize),
     ) {
         let taken_fix = taken.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
+        let known = taken_fix.map_or(*ours, |fix| Motion::at(&fix, ours));
+        let stepped = taken_fix.is_some_and(|fix| ours.has_stepped(&fix));
+        let moves = |n: &Neighbour| {
+            if stepped {
+                n.carried_with(&known)
+            } else {
+                n.beside(&known)
+            }
+        };
         let (sights, _) = self.sights(candidates, taken, |n, c| {
-            let motion = taken_fix.map_or(n.motion, |fix| n.motion.given(ours, &fix));
-            let surprise = motion.surprise(&c.fix);
+            let surprise = moves(n).surprise(&c.fix);
             let lead = ours.surprise(&c.fix) - surprise;
             if taken.is_none() && lead < config.certainty {
                 f64::INFINITY
@@ -229,13 +253,20 @@ impl Neighbours {
             let Some(n) = slot else { continue };
             if let Some(c) = sight.and_then(|k| candidates.get(k)?.as_ref()) {
                 n.motion.update(&c.fix);
+                if let Some(own) = &taken_fix {
+                    n.apart.update(&between(own, &c.fix));
+                }
                 n.amplitude += AMPLITUDE_SHARE * (c.fix.amplitude - n.amplitude);
                 n.seen_s = time_s;
                 n.sights = n.sights.saturating_add(1);
+            } else if let Some(own) = taken_fix.filter(|_| stepped) {
+                // The flow took it along, unseen.
+                n.motion.carry(ours.way_to(&own));
             }
             // While the chosen bead is out of sight nobody is forgotten: it may have been hidden by just this one.
-            let (x, y) = n.motion.position();
-            let sure_px = 3.0 * n.motion.sd_px();
+            let motion = moves(n);
+            let (x, y) = motion.position();
+            let sure_px = 3.0 * motion.sd_px();
             let beyond = |c: f64, len: usize| c < -sure_px || c > len as f64 - 1.0 + sure_px;
             let left = beyond(x, width) || beyond(y, height);
             let memory_s = if left { config.coast_limit_s } else { MEMORY_S };
@@ -246,9 +277,7 @@ impl Neighbours {
             }
         }
         // What is left over is a new neighbour, as long as the chosen bead itself is in sight: otherwise it may be it.
-        if taken.is_none() {
-            return;
-        }
+        let Some(own) = taken_fix else { return };
         for (k, c) in candidates.iter().enumerate() {
             if let Some(c) = c
                 && taken != Some(k)
@@ -258,6 +287,7 @@ impl Neighbours {
             {
                 *free = Some(Neighbour {
                     motion: Motion::new(&c.fix),
+                    apart: Motion::new(&between(&own, &c.fix)),
                     amplitude: c.fix.amplitude,
                     seen_s: time_s,
                     sights: 1,

@@ -196,7 +196,7 @@ impl Tracker {
         let own_px = chosen.motion.position();
         let share = self.config.max_amplitude_change / 3.0;
         let contrast = |amplitude: f64| Some((amplitude, share * amplitude.abs()));
-        let neighbours = self.neighbours.predictions();
+        let neighbours = self.neighbours.predictions(&chosen.motion);
         let near = neighbours.filter(|(x, y, _)| f64::hypot(x - own_px.0, y - own_px.1) < reach_px);
         let own = (own_px.0, own_px.1, chosen.identity.amplitude());
         let (mut starts, mut n): (Starts, _) = (Default::default(), 0);

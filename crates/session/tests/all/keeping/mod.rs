@@ -52,6 +52,21 @@ fn steps_of_the_flow_and_stalls_keep_the_bead_under_every_law_and_the_last_word_
     assert!(broken.is_empty(), "{broken:#?}");
 }
 
+/// Commands that are to stop such a flow move both beads by more than lies between them, before the tracker knows how much of a command acts.
+#[test]
+fn a_fast_flow_and_the_commands_against_it_take_no_bead_beside_another() {
+    let row = Row {
+        second_um: Some(1.5),
+        ..Row::step("lqg", -985.0)
+    };
+    let limits = Limits::of_the_loop();
+    for seed in [1021, 1036] {
+        let held = hold(&row.clone().again(5), seed);
+        let broken = limits.broken(&row, &held);
+        assert!(broken.is_empty(), "seed {seed}: {broken:#?}");
+    }
+}
+
 #[test]
 fn a_run_that_did_not_keep_its_bead_says_so_whatever_the_reason() {
     for (row, why) in [
