@@ -1,4 +1,4 @@
-//! What can be wrong with what the workflow is given.
+//! Errors in the input of the workflow.
 
 /// Why no verdict was reached.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

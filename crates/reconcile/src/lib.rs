@@ -1,9 +1,14 @@
 //! Finds where simulation and measurement disagree, names the missing effect, adds it to the model and measures the gap again.
 //!
-//! [`reconcile`] takes a model and records and returns one of five verdicts: *named*, *named with a remainder*, *ambiguous*
-//! (the records cannot separate several effects), *unknown* (no effect of the catalogue explains enough), or *nothing
-//! missing*. All scores are sums of squared innovations of the model's own Kalman filter ([`NoiseModel`]). The free-run
-//! residual would not do: for a perfect model of this rig it is a random walk.
+//! [`reconcile`] takes a model and records and returns one of five verdicts:
+//! - *named*;
+//! - *named with a remainder*;
+//! - *ambiguous*: the records cannot separate several effects;
+//! - *unknown*: no effect of the catalogue explains enough;
+//! - *nothing missing*.
+//!
+//! All scores are sums of squared innovations of the model's own Kalman filter ([`NoiseModel`]). The free-run residual would
+//! not do: for a perfect model of this rig it is a random walk.
 //!
 //! Not for identifying a plant from nothing (that is `cellpos-ident`), and not for files: records come as columns.
 //!

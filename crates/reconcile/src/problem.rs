@@ -63,13 +63,13 @@ pub(crate) struct Prepared {
 }
 
 impl Prepared {
-    /// Innovations of a residual, in standard deviations, without what an unknown state at the record's start makes.
+    /// Innovations of a residual, in standard deviations, without the response to an unknown state at the record's start.
     pub(crate) fn whiten(&self, r: &[f64], e: &mut [f64]) {
         self.whitener.apply(r, e);
         self.free.take_off(e);
     }
 
-    /// The same in rows of their own.
+    /// The same in separate rows.
     pub(crate) fn whitened(&self, r: &[f64]) -> Vec<f64> {
         let mut e = vec![0.0; r.len()];
         self.whiten(r, &mut e);
@@ -132,8 +132,8 @@ impl Prepared {
     }
 }
 
-/// Free motions of a record: of an unknown working point that of a zero flow that is off; of a plant that did not rest before the record
-/// the decays of its poles.
+/// Free motions of a record. With an unknown working point: the motion of a wrong zero flow. For a plant that did not rest before
+/// the record: the decays of its poles.
 fn transients(base: &Base, flow: &FlowPaths, rows: usize) -> Vec<Vec<f64>> {
     let mut all = Vec::new();
     if base.free_working_point {
@@ -187,8 +187,8 @@ pub(crate) struct Problem {
     pub noise: NoiseModel,
     /// Bounds of the share of the newest command's direct path that a frame already shows \[um per um\].
     ///
-    /// The direct path of Eq. (6) acts at once; a frame whose exposure straddles the command's edge shows a part of it.
-    /// It is a nuisance of every fit, the null included: worth at most 19 nm per um of command step.
+    /// The direct path of Eq. (6) acts at once; a frame whose exposure straddles the command's edge shows a part of it. It is a
+    /// nuisance parameter of every fit, the null included: worth at most 19 nm per um of command step.
     pub soft: (f64, f64),
     /// The positions come in steps that are not small compared with their increments.
     pub quantised: bool,
@@ -278,7 +278,7 @@ impl Problem {
         self.work.fetch_add(work, Ordering::Relaxed);
     }
 
-    /// Work of all simulations until now. The same for any number of threads, where none of them is at work.
+    /// Work of all simulations until now. It is the same for any number of threads if all are idle.
     pub(crate) fn spent(&self) -> u64 {
         self.work.load(Ordering::Relaxed)
     }

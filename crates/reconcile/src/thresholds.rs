@@ -1,73 +1,76 @@
 //! Every number that decides a verdict, with its reason and the test that pins it.
 
-/// Price of a free number in twice the log-likelihood: what its value takes to be told from its range, to a few percent of it.
+/// Price of a free number in twice the log-likelihood: the information that narrows its value from its whole range to a few
+/// percent of the range.
 pub(crate) const NUMBER: f64 = 8.0;
 
 /// Probability by which chance makes one false step in a whole search.
 pub(crate) const CHANCE: f64 = 0.05;
 
-/// What is beyond so many standard deviations is no chance: [`CHANCE`] over [`Thresholds::trials`], in the upper tail of a normal
-/// distribution. Cells of the map and numbers of a set are fewer, by as much as the shape of a floor (a walk and white noise) and of an
-/// equation is not that of nature to the last percent. Pinned by `records_that_hide_nothing_get_no_name`.
+/// An excess beyond this number of standard deviations is not due to chance: [`CHANCE`] over [`Thresholds::trials`], in the upper
+/// tail of a normal distribution. Cells of the map and numbers of a set are fewer than the trials. That margin covers the last
+/// percent by which floor (a walk and white noise) and equations differ from nature. Pinned by
+/// `records_that_hide_nothing_get_no_name`.
 pub(crate) const CHANCE_SD: f64 = 4.056;
 
-/// The numbers that decide. There is one set, [`THRESHOLDS`]; they are fields so that each has its reason beside it.
+/// The numbers that decide. There is one set, [`THRESHOLDS`]; they are fields so that each has its reason next to it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Thresholds {
-    /// Factor, for the error of the noise estimate, on what an addition must gain in twice the log-likelihood: the quantile of chi-square
-    /// with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
+    /// Factor, for the error of the noise estimate, on the least gain of an addition in twice the log-likelihood. That gain is the
+    /// quantile of chi-square with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
-    /// What a response to the command must gain beside others, in parts of what is explained already: the equations of the
-    /// first effect are not those of nature to the last digit. Pinned by the tests' simulator (relays for play operators).
+    /// Least gain of a further response to the command, as a share of the gain explained already. The equations of the first
+    /// effect are not exactly nature's. Pinned by the tests' simulator (relays for play operators).
     pub addition_share: f64,
-    /// Rivals closer than this in twice the log-likelihood cannot be told from the winner: e^5 to 1.
-    /// Pinned by `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
+    /// Rivals closer than this in twice the log-likelihood count as equal to the winner: e^5 to 1. Pinned by
+    /// `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
     pub tie: f64,
     /// A set that closes less than this part of the excess over the floor is no explanation.
     /// Pinned by `jumps_of_the_bead_are_unknown_and_it_says_where`.
     pub closed_least: f64,
-    /// A set that closes less than this leaves a remainder that is said, where what is left is beyond chance.
+    /// A set that closes less than this leaves a remainder; the verdict names it if the rest is beyond chance.
     pub closed_whole: f64,
-    /// An excess beyond so many standard deviations of its own scatter is no chance. Pinned with the two above.
+    /// An excess beyond this number of standard deviations of its scatter is not due to chance. Pinned with the two above.
     pub left_sd: f64,
-    /// By this part at least the free-run error must fall on data that was not fitted, where it is beyond what the walk of
-    /// the noise makes: an effect that predicts nothing over seconds is no effect of the response.
+    /// The free-run error on data that was not fitted must fall at least by this share, if it is larger than the walk of the
+    /// noise. An effect that predicts nothing over seconds is no effect of the response.
     pub free_run_fall: f64,
-    /// On held-out records innovations must close this part of their gap: of some two hundred true names of the tests' simulator, twice what
-    /// can be detected at all among them, none closed less than 0.58; a few rows of jumps look like an
-    /// effect that closes 0.02, an outflow that resists with the square of the speed like one that closes 0.47.
+    /// On held-out records innovations must close this share of their gap. The tests' simulator gave some two hundred true names,
+    /// some only twice as large as the smallest detectable effect; none closed less than 0.58. A few rows of jumps look like an
+    /// effect that closes 0.02. An outflow that resists with the square of the speed looks like one that closes 0.47.
     pub held_out_least: f64,
     /// Numbers that move by more than this part between parts of the records, beyond their intervals, belong to another
     /// equation. Pinned by `numbers_that_change_with_the_part_of_the_data_are_no_name`.
     pub split_share: f64,
     /// An effect smaller than the smallest that matters is not named unless it explains this part of the excess.
     pub small_share: f64,
-    /// An effect beside larger ones that explains less than this part of the gap may be the difference between the catalogue's
-    /// equation of these and the rig's: it is no name where their freer forms gain as much. Beyond it, and of two of like size,
-    /// nobody would say which is the other's form. Pinned by `a_small_effect_that_another_form_of_the_large_one_explains_is_no_name`.
+    /// A small effect that explains less than this share of the gap may be the difference between the catalogue's equation of a
+    /// larger effect and the rig's. It gets no name if freer forms of the larger ones gain as much. Beyond this share, and for two
+    /// effects of like size, nobody could say which is the other's form. Pinned by
+    /// `a_small_effect_that_another_form_of_the_large_one_explains_is_no_name`.
     pub companion_share: f64,
-    /// Larger is what explains so many times as much. Pinned with it.
+    /// An effect is larger if it explains this many times as much. Pinned with it.
     pub companion_times: f64,
-    /// Beside a companion that is real, freer forms of the large ones gain less than this part of what it gains: in the tests' simulator
-    /// 0.05 at most where it was hidden, 0.16 at least where it was not. Pinned with it.
+    /// Next to a real companion, freer forms of the large effects gain less than this share of the companion's gain. In the tests'
+    /// simulator they gained at most 0.05 if the companion was hidden, and at least 0.16 if it was not. Pinned with it.
     pub companion_rest: f64,
-    /// Of a companion whose main number lies outside the range that rigs show, freer forms need gain this part only: a creep by a power
-    /// law leaves what looks like a relaxation of a millisecond.
+    /// If the main number of a companion is outside the range of known rigs, this share is enough: a creep by a power law leaves a
+    /// residual like a relaxation of a millisecond.
     pub companion_untypical: f64,
-    /// What is smaller beside the others than [`Self::addition_share`] must gain so many times what any addition must.
-    /// Pinned by `a_small_effect_of_its_own_is_named_beside_a_large_one`.
+    /// An addition smaller than [`Self::addition_share`] must gain this many times the usual least gain. Pinned by
+    /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
     pub small_gain: f64,
-    /// A hysteresis of which a curve without memory in front of the plant explains this part is none: of relays it explains 0.4 to
-    /// 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
+    /// A hysteresis gets no name if a curve without memory in front of the plant explains this share of it. For relays that share
+    /// is 0.4 to 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
     pub curve_share: f64,
-    /// Rows of rest or of repeated command from which noise is known to a few percent, and rows in all from which effects can be told apart.
+    /// Rows of rest or of repeated command that give the noise to a few percent, and rows in all that can separate effects.
     pub floor_rows: usize,
     /// A command counts as at rest where its range is below this part of the range of all records: a measured input is
     /// never quite still. Pinned by `a_measured_input_rests_and_repeats_within_its_own_noise`.
     pub rest_share: f64,
-    /// A command repeats where its difference from one period to the next has an RMS below this part of its own, and does
-    /// not grow from period to period as that of a swelling sine does: the noise of a measured input.
-    /// Pinned by `a_measured_input_rests_and_repeats_within_its_own_noise`.
+    /// A command repeats if its difference from one period to the next has an RMS below this share of the command's. It must not
+    /// grow from period to period, as the difference of a swelling sine does: then it is the noise of a measured input. Pinned by
+    /// `a_measured_input_rests_and_repeats_within_its_own_noise`.
     pub repeat_share: f64,
     /// A stated noise is believed only where the records do not fall below it by more than this part.
     pub stated_excess: f64,
@@ -78,21 +81,23 @@ pub struct Thresholds {
     pub line_above: f64,
     /// Price, in twice the log-likelihood, of a main parameter outside the range that rigs show: decides ties between names.
     pub untypical: f64,
-    /// The same, in parts of what a fit leaves over: one that is wrong elsewhere decides little by its last percent.
+    /// The same, as a share of the residual of a fit: if a fit is wrong elsewhere, its last percent decides little.
     pub untypical_share: f64,
-    /// A walk may differ from the model's by this part for the model's localisation noise to be believed of this rig: the
-    /// radius of a bead and the viscosity of a warm room make so much. Pinned with it.
+    /// The model's localisation noise is believed for this rig if the walk differs from the model's by at most this share. The
+    /// radius of a bead and the viscosity in a warm room explain such a difference. Pinned with it.
     pub walk_alike: f64,
     /// A fit that leaves more than this per row is rough: what rivals differ by in their last percent decides nothing.
     pub rough: f64,
-    /// A single row is a jump beyond so many standard deviations. Pinned by `jumps_of_the_bead_are_unknown_and_it_says_where`.
+    /// A single row is a jump beyond this number of standard deviations. Pinned by
+    /// `jumps_of_the_bead_are_unknown_and_it_says_where`.
     pub jump_sd: f64,
-    /// What a term must gain in twice the log-likelihood to be taken into a formula of what is left.
+    /// Least gain in twice the log-likelihood of a term in a formula of the residual.
     pub term_worth: f64,
-    /// What it must gain to count as left over: some forty terms, each at chi-square with one number, are beyond chance at 25;
-    /// the rest is for a noise whose shape is not quite a walk and white noise.
+    /// Least gain that counts as a remainder: of some forty terms, each at chi-square with one number, 25 is beyond chance. The
+    /// rest allows for noise that is not quite a walk and white noise.
     pub term_least: f64,
-    /// And in parts of what the set gains, for no equation is nature's to the last digit: what a split may gain by numbers of its own, too.
+    /// The same as a share of the set's gain, because no equation is exactly nature's. It also bounds the gain of a split that has
+    /// separate numbers.
     pub term_share: f64,
     /// With a remainder a set of a search that ended with its budget must close so much: else it may be a compromise between others.
     pub cut_closed: f64,
@@ -103,19 +108,19 @@ pub struct Thresholds {
     /// Shortest total length of records with a changing command, of a rig whose noise is a walk \[s\].
     /// Pinned by `wrong_units_constant_inputs_short_and_foreign_records_get_a_message`, as is the next.
     pub needed_s: f64,
-    /// The same of records of other plants, which may be sampled slowly: fewer rows than a floor needs end without a name, and
-    /// with what the rest looks like.
+    /// The same for records of other plants, which may be sampled slowly. Records with fewer rows than a floor needs end without a
+    /// name; the verdict then says only how the residual looks.
     pub needed_rows_of_others: usize,
     /// Below this part of the motion a record does not go with the model in any sense.
     pub least_alike: f64,
     /// Fewest missing or repeated frames that are a fault of the camera: fewer are a start-up glitch. Pinned by the counts of
     /// the labelled cases, as are the others of frames.
     pub faults_least: usize,
-    /// Smallest rate of missing or repeated frames that is told.
+    /// Smallest rate of missing or repeated frames that is reported.
     pub faults_rate: f64,
-    /// Repeats beyond those by chance, in standard deviations of these.
+    /// Excess of repeats over those by chance, in standard deviations of the chance repeats.
     pub repeats_sd: f64,
-    /// And in parts of them.
+    /// The same as a share of the chance repeats.
     pub repeats_share: f64,
     /// Rows that repeat more often than this are no camera's: a sensor that counts, or rows that were held.
     pub repeats_most: f64,

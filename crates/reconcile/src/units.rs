@@ -1,8 +1,8 @@
-//! Units: those in which records are and results are told, and what one of them counts for within a search.
+//! Units of the records and of the results, and their factor within a search.
 //!
-//! A search has bounds, smallest sizes and steps in micrometres, the size of this rig's motion. Records of another plant may
-//! be in anything: they are brought to that size first, every number of the model with them, and what is found is told in
-//! their own units. A record times a thousand is so the same record.
+//! A search has bounds, smallest sizes and steps in micrometres, the size of this rig's motion. Records of another plant may be in
+//! any unit. They are brought to that size first, with every number of the model, and the results are given in the records' units.
+//! So a record times a thousand is the same record.
 
 use crate::data::record::{Record, command_range_um};
 use crate::error::ReconcileError;
@@ -41,7 +41,7 @@ pub fn figure(x: f64) -> String {
     figure_of(x, 3)
 }
 
-/// A figure with so many digits, whatever unit it is in.
+/// A figure with this number of digits, in any unit.
 pub fn figure_of(x: f64, digits: i32) -> String {
     if x == 0.0 || !x.is_finite() {
         return format!("{x}");
@@ -54,7 +54,7 @@ pub fn figure_of(x: f64, digits: i32) -> String {
     }
 }
 
-/// What one unit of the records counts for within a search, and how it is called.
+/// The factor of one unit of the records within a search, and its name.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Scales {
     names: Units,
@@ -164,7 +164,7 @@ impl Scales {
         [self.input, self.output]
     }
 
-    /// Whether the records are in units of their own.
+    /// Whether the records have other units than this rig's.
     pub(crate) fn is_of_records(&self) -> bool {
         self.per_unit() != [1.0, 1.0]
     }
@@ -206,7 +206,7 @@ impl Scales {
         format!("{} {}", figure(self.output(um)), self.names.output)
     }
 
-    /// A coefficient that makes something of `side` of so many commands, positions and seconds: its value and its unit.
+    /// A coefficient that gives a `side` from a product of this many commands, positions and seconds: its value and its unit.
     pub(crate) fn coefficient(&self, value: f64, side: Side, powers: [i32; 3]) -> (f64, String) {
         let [of_input, of_output, seconds] = powers;
         let (made, name) = self.side(side);
@@ -220,8 +220,8 @@ impl Scales {
         (value * factor, unit)
     }
 
-    /// The factor that brings a number of a kind of effect, as the search has it, into the unit of the records, and that unit;
-    /// None of a number without a length.
+    /// The factor that brings a number of a kind of effect from the search's unit to the records' unit, and that unit; None for a
+    /// number without a length.
     pub(crate) fn of_number(&self, kind: &dyn EffectKind, unit: &str) -> Option<(f64, String)> {
         let power = power_of(unit);
         if power == 0 || kind.definition().is_some() {
@@ -263,7 +263,7 @@ impl Scales {
         self.effect(effect, false)
     }
 
-    /// A model of these records as the search has it.
+    /// A model of these records in the search's units.
     ///
     /// # Errors
     /// A plant whose gain has no number then.
@@ -340,7 +340,7 @@ mod tests {
     #[test]
     fn units_are_told_as_products_of_powers() {
         let scales = of_volts_and_rpm();
-        // A force that goes with the cube of the position.
+        // A force in proportion to the cube of the position.
         let (value, unit) = scales.coefficient(2.0, Side::Input, [0, 3, 0]);
         assert!((value / (2.0 * 1e-6 / 4.0) - 1.0).abs() < 1e-12);
         assert_eq!(unit, "V/rpm^3");

@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes):
-/// a bead that jumps is no noise, and must not raise the floor under which its jumps would then hide.
+/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes). A bead
+/// that jumps is no noise: its jumps must not raise the floor that would then hide them.
 pub(super) fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
     let mut sizes: Vec<f64> = (1..e.len())
         .filter(|&k| present[k] && present[k - 1])

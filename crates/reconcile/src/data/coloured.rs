@@ -1,5 +1,5 @@
-//! Coloured noise of a sensor: a first-order Gauss-Markov process beside walk and white noise, fitted by likelihood where the
-//! noise is seen alone, and believed only where it leaves white innovations.
+//! Coloured noise of a sensor: a first-order Gauss-Markov process together with walk and white noise. It is fitted by likelihood
+//! to rows of noise alone, and believed only if it leaves white innovations.
 //!
 //! A walk in its stead would swallow every slow error of a model of a static sensor; white noise alone would call the slow noise
 //! an error. Not for lines: a line is no noise, and a fit that leaves one is refused.
@@ -21,10 +21,10 @@ pub enum NoiseKind {
     White,
 }
 
-/// What coloured noise must gain in twice the log-likelihood over a walk: two numbers, beyond chance, and a margin because no
-/// noise is of either kind to the last percent.
+/// Least gain of coloured noise over a walk in twice the log-likelihood: two numbers, beyond chance, and a margin because no noise
+/// is exactly of either kind.
 const WORTH: f64 = 30.0;
-/// What a walk beside coloured noise must gain.
+/// Least gain of a walk next to coloured noise.
 const WORTH_OF_WALK: f64 = 15.0;
 /// Largest ordinate of the periodogram of white innovations, in units of its mean: one in 10^13 each.
 const LINE: f64 = 30.0;
@@ -52,7 +52,7 @@ fn cost(alone: &Alone<'_>, shape: &NoiseModel) -> (f64, f64) {
     (n * size.ln() + w.log_determinant(), size)
 }
 
-/// A shape: white variance 1, logarithms of the others in parts of it; `None` where there is none.
+/// A shape: white variance 1, logarithms of the other variances over it; `None` without them.
 #[derive(Debug, Clone, Copy)]
 struct Shape {
     walk: Option<f64>,
@@ -73,7 +73,7 @@ impl Shape {
         }
     }
 
-    /// The neighbours at a step, within what can be told from white noise and from a level.
+    /// The neighbours of a step, as far as they differ from white noise and from a level.
     fn neighbours(self, step: f64, most_rows: f64) -> Vec<Self> {
         let mut all = Vec::new();
         for way in [-step, step] {
@@ -241,7 +241,7 @@ mod tests {
     fn coloured_noise_is_found_with_its_size_and_time() {
         let noise = chosen(&series(12_000, [4.0, 40.0, 0.0, 0.0], 3), NoiseKind::Auto);
         let c = noise.coloured.expect("coloured");
-        // 12000 rows are 150 times of 40: 12 % each way for the variance, three of them.
+        // 12000 rows are 150 times of 40: the variance is known to 12 % each way; three such errors.
         assert!((c.variance_um2 / 4.0).ln().abs() < 0.4, "{noise:?}");
         assert!((c.time_rows / 40.0).ln().abs() < 0.4, "{noise:?}");
         assert!((noise.white_um2 - 1.0).abs() < 0.1, "{noise:?}");

@@ -64,7 +64,7 @@ struct Estimate {
     c0: f64,
     c1: f64,
     rows: usize,
-    /// How many of these are independent, in parts of them.
+    /// The independent share of these.
     independent: f64,
     source: FloorSource,
     /// The noise itself, lines and jumps off, and which rows count.
@@ -95,14 +95,14 @@ impl Estimate {
         NoiseModel::from_increments(self.c0, self.c1).innovation_um()
     }
 
-    /// The most that the standard deviation is, by so many increments.
+    /// The upper limit of the standard deviation after this number of increments.
     fn most(&self) -> f64 {
         self.sigma() * (1.0 + error_of(self.independent()))
     }
 }
 
-/// Error of a noise's standard deviation from so many increments, in parts of it: three standard deviations, for of several estimates
-/// one is small by chance. A noise that was not measured is taken as it is stated.
+/// Relative error of a noise's standard deviation from this number of increments: three standard deviations, because one of
+/// several estimates is small by chance. A noise that was not measured is taken as stated.
 pub(crate) fn error_of(rows: usize) -> f64 {
     match rows {
         0 => 0.0,
@@ -112,12 +112,11 @@ pub(crate) fn error_of(rows: usize) -> f64 {
 
 /// Estimates both noises from residuals of the null model.
 ///
-/// A rest record shows the noise itself (lines at the mains frequency and a drift taken off); of a record whose command
-/// repeats, the difference of successive periods cancels every response that repeats, and so does the difference of two
-/// records of the same command. The one that is surely smallest rules, with those that differ from it by chance: a misfit can only
-/// add, and the smallest of several that are known badly is too small. Without any, what the model states is
-/// taken, as long as the records do not lie below it; and without that, the floor is not known, and the increments of the
-/// residuals stand in for the figures alone.
+/// A rest record shows the noise itself (lines at the mains frequency and a drift removed). If the command of a record repeats,
+/// the difference of successive periods cancels every response that repeats; so does the difference of two records of the same
+/// command. The surely smallest estimate rules, with those that differ from it by chance: a misfit can only add, and the smallest
+/// of several uncertain ones is too small. Without any estimate the model's noise is taken, unless the records are below it.
+/// Without that the floor is not known, and the increments of the residuals replace it in the figures alone.
 pub(crate) fn estimate(
     records: &[Record],
     present: &[Vec<bool>],
@@ -144,7 +143,7 @@ pub(crate) fn estimate(
     // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
     let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
     let kind = if unasked { NoiseKind::Walk } else { kind };
-    // Where no record as a whole tells the noise, parts of them may: a misfit can only add.
+    // If no whole record shows the noise, parts of records may: a misfit can only add.
     if found.is_empty() {
         found = of_parts(records, present, residuals);
     }
@@ -167,7 +166,8 @@ pub(crate) fn estimate(
         .map(|least| {
             let all = pooled(&own, least);
             let walk = NoiseModel::from_increments(all.c0, all.c1);
-            // What a base that was fitted to these records leaves is a sensor's noise or a slow disturbance: seldom a walk.
+            // The residual of a base that was fitted to these records is a sensor's noise or a slow disturbance, and seldom a
+            // walk.
             choose(kind, walk, &least.alone()).at_least(quantum_um2)
         });
     let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
@@ -192,14 +192,15 @@ pub(crate) fn estimate(
     }
 }
 
-/// Independent squares in the sum of those of so many successive differences, in parts of their number. Neighbours share a noise: their
-/// correlation is -1/2, that of their squares 1/4, and the sum of `m` of them scatters as that of `m^2/(m + (m - 1)/2)` independent ones.
+/// Independent squares in the sum over this number of successive differences, as a share of the number. Neighbours share a noise:
+/// their correlation is -1/2, that of their squares 1/4, and the sum of `m` squares scatters as that of `m^2/(m + (m - 1)/2)`
+/// independent ones.
 fn independent(differences: f64) -> f64 {
     let m = differences.max(1.0);
     m / (m + 0.5 * (m - 1.0))
 }
 
-/// What whole records tell of the noise. Each row tells once: by the rest or the periods of its own record, else by the record before it
+/// The noise that whole records show. Each row counts once: by the rest or the periods of its record, else by the previous record
 /// with the same command.
 fn of_records(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
     let whole = crate::data::record::command_range_um(records);
@@ -262,7 +263,7 @@ fn of_parts(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -
     found
 }
 
-/// An estimate from residuals or differences that hold nothing but noise, `share` of it that of one record.
+/// An estimate from residuals or differences that contain noise alone, `share` times that of one record.
 fn of(e: &[f64], ok: &[bool], sample_s: f64, source: FloorSource, share: f64) -> Estimate {
     let (clean, fitted) = without_lines(e, ok, sample_s);
     let counts = without_jumps(&clean, ok);
@@ -349,8 +350,8 @@ fn quantisation_um2(records: &[Record]) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// A noise with the walk and the white noise of the greatest likelihood; `unlikelihood` is twice the negative log-likelihood of what a fit
-/// leaves. Increments alone would take a zero flow that drifts for a walk.
+/// A noise with the walk and the white noise of the greatest likelihood; `unlikelihood` is twice the negative log-likelihood of a
+/// fit's residual. Increments alone would take a zero flow that drifts for a walk.
 pub(crate) fn refined(noise: &NoiseModel, unlikelihood: impl Fn(&NoiseModel) -> f64) -> NoiseModel {
     // Shares of the increments' variance that white noise may have, as [`NoiseModel::from_increments`] has them.
     const LEAST: f64 = -0.25;
@@ -433,8 +434,8 @@ mod tests {
         assert!((floor.sigma() - 1.0).abs() < 1e-9);
     }
 
-    /// Records of a walk behind a command of 450 rows, so many times, and the estimates of their noise over many seeds: the scatter of the
-    /// variance in parts of what as many independent increments have as are stated.
+    /// Estimates of the noise over many seeds, each from this number of records: a walk behind a command of 450 rows. Checked: the
+    /// scatter of the variance over that of the stated number of independent increments.
     fn scatter(commands: &[Vec<f64>]) -> f64 {
         const SEEDS: u64 = 300;
         let mut squares = 0.0;

@@ -1,7 +1,7 @@
-//! Where the zero flow was in a record: its most probable path, from what a fit leaves.
+//! The zero flow in a record: its most probable path, from the residual of a fit.
 //!
-//! What a bead does of its own (sticking, another gain outward than inward, a gain that changes) it does with the flow that carries
-//! it: command less zero flow. In a closed loop the command follows the zero flow, by more than many an effect is large.
+//! Effects of a bead (sticking, another gain outward than inward, a gain that changes) act on the flow that carries it: command
+//! less zero flow. In a closed loop the command follows the zero flow, and that motion is larger than many effects.
 
 use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
@@ -43,7 +43,7 @@ pub(crate) fn motion_um(
         *m += drifts * (k as f64 - middle);
     }
     if off {
-        // Of any size: what fits best beside the rest.
+        // Of any size: the best fit next to the rest.
         let mut at = 0.0;
         let known: Vec<f64> = (motion.iter())
             .map(|m| {
@@ -115,9 +115,9 @@ mod tests {
 
     #[test]
     fn the_path_of_a_zero_flow_is_found_whether_it_wanders_drifts_or_is_off() {
-        // 5 nm a row about nothing; beside it 1e-6 um more in every row; beside it an offset of 30 nm a row, which is free.
+        // 5 nm a row about nothing; then 1e-6 um more in every row; then an offset of 30 nm a row, which is free.
         let rows = 20_000;
-        // Of a slow sine so much is told from the walk: the power of the zero flow there in parts of both.
+        // The share of a slow sine that differs from the walk: the power of the zero flow there over that of both.
         let noise = noise();
         let z = noise.zero_flow.expect("a zero flow");
         let power = 2.0 * z.motion_um2 * z.time_rows / (1.0 + (z.time_rows / 1500.0).powi(2));

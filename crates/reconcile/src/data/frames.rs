@@ -13,12 +13,12 @@ pub(crate) struct FrameCounts {
     pub repeats: usize,
     /// Exact zero increments that the resolution of the file gives by chance.
     pub by_chance: f64,
-    /// Runs of repeats that follow a run in the same record, and how many of them do so at the distance met most.
+    /// Runs of repeats that follow a run in the same record, and how many follow at the commonest distance.
     pub runs: usize,
     pub in_rhythm: usize,
     /// Repeats in runs longer than a camera's stutter.
     pub at_rest: usize,
-    /// The positions come in steps that are not small beside their increments.
+    /// The positions come in steps that are not small compared with their increments.
     pub quantised: bool,
     /// Whether rows are frames of a camera, whose faults have names; else they are rows of a logger.
     pub of_camera: bool,
@@ -53,8 +53,8 @@ impl FrameCounts {
             && self.looks_like_a_camera()
     }
 
-    /// A sensor that counts, rows that were held, and a plant that stands still give equal rows as well: those come often, in a
-    /// rhythm, or for long; faults of a camera come seldom and by chance, alone or a few at a time.
+    /// A sensor that counts, rows that were held, and a plant that stands still also give equal rows. Those come often, in a
+    /// rhythm, or for long. Faults of a camera come seldom and by chance, alone or a few at a time.
     fn looks_like_a_camera(&self) -> bool {
         let rate = self.repeats as f64 / self.pairs.max(1) as f64;
         !self.quantised
@@ -85,7 +85,7 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
     let mut distances: BTreeMap<usize, usize> = BTreeMap::new();
     for r in records {
         let n = r.rows();
-        // What lies before the first bead seen and behind the last says nothing of the camera.
+        // Rows before the first bead and after the last say nothing of the camera.
         let seen = |b: &f64| b.is_finite();
         if let (Some(first), Some(last)) = (
             r.bead_um.iter().position(seen),
@@ -137,8 +137,8 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
     c
 }
 
-/// The step in which positions are written: with so many digits behind the point it is one, with so many digits in all it grows
-/// with the position.
+/// The step of written positions. With a fixed number of decimals it is constant; with a fixed number of digits it grows with the
+/// position.
 struct Steps {
     finest: f64,
     /// Smallest increment by the position's power of two.
@@ -150,15 +150,15 @@ impl Steps {
         let mut by_size: BTreeMap<i32, f64> = BTreeMap::new();
         for w in r.bead_um.windows(2) {
             let (d, power) = ((w[1] - w[0]).abs(), power_of_two(w[1]));
-            // What rounding of the arithmetic leaves is no step.
+            // A difference by rounding in the arithmetic is no step.
             let counts = d.is_finite() && d > 1e-12 * w[1].abs();
             if counts && power == power_of_two(w[0]) {
                 let least = by_size.entry(power).or_insert(d);
                 *least = least.min(d);
             }
         }
-        // A step does not get finer where positions get larger, and grows by ten where they do: what a size with few rows may have
-        // missed, its neighbours tell.
+        // A step does not become finer for larger positions, and grows by tens. So the neighbours show a step that a size with few
+        // rows may have missed.
         let told = by_size.clone();
         for (power, step) in &mut by_size {
             for (other, least) in &told {
@@ -267,7 +267,7 @@ mod tests {
 
     #[test]
     fn the_rate_of_repeats_is_right_of_a_bead_that_crosses_zero() {
-        // A bead about zero, in fine steps: few rows of it are of any one small size, and their least increment is no step.
+        // A bead about zero, in fine steps. Few rows are of any one small size, and their least increment is no step.
         let mut noise = 5u64;
         let mut y: Vec<f64> = (0..20_000)
             .map(|k| {

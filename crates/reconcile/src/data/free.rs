@@ -8,7 +8,7 @@ use crate::dot::dot;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Free {
     directions: Vec<(Vec<f64>, f64)>,
-    /// Size of the first of them.
+    /// Size of the first motion.
     first_size: f64,
     log_determinant: f64,
 }

@@ -25,8 +25,8 @@ impl ZeroFlow {
 
     /// Mean square of its path over `rows`, about the mean or, with `ramp`, about its regression line \[um^2\].
     pub fn path_um2(&self, rows: f64, ramp: bool) -> f64 {
-        // A velocity kept for good is a ramp, n^2/12 about its mean; one that walks by q a row makes q n^3/30 and q n^3/420 about the
-        // line; one forgotten at once is a walk of 2 V T a row. What it is in truth is below each of them.
+        // A constant velocity is a ramp: n^2/12 about its mean. A velocity that walks by q a row makes q n^3/30, and q n^3/420
+        // about the line. One without memory is a walk of 2 V T a row. The true motion is below each bound.
         let walk = 2.0 * self.motion_um2 * self.time_rows * rows;
         let changes = self.fresh_um2() * rows.powi(3);
         if ramp {

@@ -1,10 +1,10 @@
 //! What is always present: Brownian motion of the bead and white localisation noise; what may be: a sensor that is slow, a zero flow
 //! that moves. And the filter that knows them.
 //!
-//! The free-run residual of a PERFECT model is a random walk plus white noise: its size says nothing. Its innovations in
-//! the Kalman filter of that process (state: the walk; measurement: walk plus noise) are white with variance 1 in the
-//! units used here, whatever the length of the record. All scores of this crate are sums of squares of those
-//! innovations, so a log-likelihood is half their difference. Missing frames are predictions without an update.
+//! The free-run residual of a PERFECT model is a random walk plus white noise: its size says nothing. Its innovations in the
+//! Kalman filter of that process (state: the walk; measurement: walk plus noise) are white with variance 1 in the units used here,
+//! whatever the length of the record. All scores of this crate are sums of squared innovations, so a log-likelihood is half their
+//! difference. Missing frames are predictions without an update.
 
 use crate::data::motion::ZeroFlow;
 
@@ -13,12 +13,12 @@ use crate::data::motion::ZeroFlow;
 pub struct NoiseModel {
     /// Variance gained by the walk in one sample, `2 D dt` \[um^2\].
     pub walk_um2: f64,
-    /// Variance of the localisation noise, less what the exposure averages off the walk \[um^2\].
+    /// Variance of the localisation noise, less the part of the walk that the exposure averages out \[um^2\].
     pub white_um2: f64,
     /// Noise of a sensor that is slow and returns.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub coloured: Option<Coloured>,
-    /// Motion of the zero flow; never beside [`Self::coloured`], which is that of a sensor without a bead.
+    /// Motion of the zero flow; never together with [`Self::coloured`], which belongs to a sensor without a bead.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_flow: Option<ZeroFlow>,
 }
@@ -54,8 +54,8 @@ impl NoiseModel {
         }
     }
 
-    /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical: a camera that averages over its exposure
-    /// takes up to `q / 6` off the white part, that of a whole row.
+    /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical: a camera that averages over its
+    /// exposure lowers the white part by up to `q / 6`, for an exposure of a whole row.
     pub fn from_increments(variance: f64, lag1: f64) -> Self {
         let variance = variance.max(1e-40);
         // q/6 of q - 2 q/6.
@@ -140,7 +140,7 @@ pub(crate) struct Whitener {
     second: Second,
 }
 
-/// The state beside the walk.
+/// The further state of the noise.
 #[derive(Debug, Clone)]
 enum Second {
     None,
@@ -158,7 +158,7 @@ struct SecondGain {
     keep: f64,
 }
 
-/// Covariance of the walk and the state beside it.
+/// Covariance of the walk and the further state.
 #[derive(Debug, Clone, Copy)]
 struct Spread {
     walk: f64,
@@ -277,8 +277,8 @@ impl Whitener {
         }
     }
 
-    /// The slow noise at every row from the rows before it alone: what a regressor may know without being correlated with the
-    /// row's own innovation.
+    /// The slow noise at every row from the rows before it alone: a regressor may know it without being correlated with the row's
+    /// own innovation.
     pub(crate) fn ahead(&self, r: &[f64]) -> Vec<f64> {
         let mut m = r.first().copied().unwrap_or(0.0);
         let mut c = 0.0;
@@ -341,7 +341,7 @@ impl Whitener {
             .collect()
     }
 
-    /// The transpose of [`Self::apply`]: what a residual at each row adds to the weighted sum of innovations.
+    /// The transpose of [`Self::apply`]: the contribution of each row's residual to the weighted sum of innovations.
     pub(crate) fn transpose(&self, weights: &[f64]) -> Vec<f64> {
         let mut z = vec![0.0; weights.len()];
         // What the states before the next row add to the weighted sum.

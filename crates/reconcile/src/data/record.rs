@@ -179,7 +179,7 @@ impl Record {
         power > 0.0 && d / n as f64 <= share * share * power
     }
 
-    /// Whether the positions come in steps that are not small beside their increments: a sensor that counts.
+    /// Whether the positions come in steps that are not small compared with their increments: a sensor that counts.
     pub fn is_quantised(&self) -> bool {
         let mut sizes: Vec<f64> = self
             .bead_um
@@ -250,7 +250,7 @@ impl Record {
         None
     }
 
-    /// The part of a record between two rows, as a record of its own.
+    /// The part of a record between two rows, as a separate record.
     pub fn part(&self, from: usize, to: usize) -> Self {
         Self {
             name: self.name.clone(),
@@ -318,8 +318,8 @@ pub(crate) fn differences(x: &[f64]) -> Option<Vec<f64>> {
     Some(out)
 }
 
-/// Puts records into an order that does not depend on that of the files, and joins parts of one record: a part that
-/// starts one sample after another ends, at a place where the bead goes on.
+/// Sorts records by their content, so that the order of the files does not matter, and joins parts of one record. A part belongs
+/// to another if it starts one sample after its end, at a place to which the bead could have moved.
 pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
     let key = |r: &Record| -> Vec<u64> {
         let mut k: Vec<u64> = vec![r.start_s.to_bits(), r.rows() as u64];

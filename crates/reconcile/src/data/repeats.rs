@@ -4,7 +4,7 @@ use crate::data::record::{Record, differences, variance};
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 
-/// Rows of a record that follow the same command as so many rows before.
+/// Rows of a record that follow the same command as the rows this far before.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Repeats {
     /// How many rows before.
@@ -76,7 +76,7 @@ fn stretches(u: &[f64], p: usize, near: f64) -> Vec<Range<usize>> {
     found
 }
 
-/// Stretches in which the command stays where it is, for long: their later halves.
+/// Long stretches with a constant command: their later halves.
 pub(crate) fn rests(r: &Record) -> Vec<Range<usize>> {
     let u = &r.pzt_um;
     let near = THRESHOLDS.rest_share * (variance(u).sqrt());

@@ -62,8 +62,9 @@ impl Prior {
         self.noise_at(noise, [0.0; 2])
     }
 
-    /// Cost of the zero flow of a noise in twice the log-likelihood, if it was estimated from the same residuals: its distance from the
-    /// medians, and by how much narrower than the prior its size and time are known (Laplace's approximation of the evidence).
+    /// Cost of the zero flow of a noise in twice the log-likelihood, if it was estimated from the same residuals. It has two
+    /// parts: the distance from the medians, and the factor by which size and time are known better than by the prior (Laplace's
+    /// approximation of the evidence).
     pub(crate) fn price(
         &self,
         noise: &NoiseModel,

@@ -41,7 +41,7 @@ fn predicted(model: &Model, pzt_um: &[f64]) -> Vec<f64> {
     carried(model, pzt_um, &[])
 }
 
-/// With what flows beside the displacement.
+/// With the flows that act next to the displacement.
 fn carried(model: &Model, pzt_um: &[f64], flow_um: &[f64]) -> Vec<f64> {
     let base = Base {
         zpk: Zpk::of(&model.plant),
@@ -89,7 +89,7 @@ fn the_predictor_and_the_simulator_of_the_program_agree_on_every_effect_that_is_
     assert!(bad.is_empty(), "{}", bad.join("\n"));
 }
 
-/// What predictor and simulator are apart by over more than a part of an effect's size (at least 10 nm), over all its starts.
+/// The starts of all variants at which predictor and simulator differ by more than this share of the effect's size (at least 10 nm).
 fn apart(variants: &[Variant], u: &[f64], bare: &[f64], part: f64) -> Vec<String> {
     let mut bad = Vec::new();
     for variant in variants {
@@ -218,7 +218,7 @@ fn the_two_agree_on_effects_of_a_user_s_own_at_every_place() {
 #[test]
 fn what_a_bead_does_of_its_own_it_does_with_the_flow_that_carries_it() {
     let u = command_um();
-    // 0.2 um beside the command: 80 um/s, more than makes the bead stick.
+    // 0.2 um of further flow: 80 um/s, enough to free a bead that sticks.
     let flow_um = vec![0.2; ROWS];
     let of_flow = predicted(&Model::eq6(), &vec![4.2; ROWS]);
     for effect in [
@@ -236,7 +236,7 @@ fn what_a_bead_does_of_its_own_it_does_with_the_flow_that_carries_it() {
                 at
             })
             .collect();
-        // What the plant alone makes of the flow is left to the noise.
+        // The motion that the plant alone makes of the flow is left to the noise.
         let whole: Vec<f64> = (carried(&model, &u, &flow_um).iter().zip(&of_flow))
             .map(|(y, flow)| y + flow)
             .collect();

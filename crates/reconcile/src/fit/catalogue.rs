@@ -48,7 +48,7 @@ impl Variant {
             .collect()
     }
 
-    /// The same for a form in the stead of another: where the kind knows what the other comes to, from there.
+    /// The same for a form in place of another: if the kind knows the numbers to which the other corresponds, from those.
     pub(crate) fn starts_from(self, part: &Part, scope: &Scope) -> Vec<Part> {
         match part
             .lag_s()
@@ -79,7 +79,7 @@ impl Variant {
         })
     }
 
-    /// How many simple forms of the effect are worth following beside a set: of forms that are limits of each other the best one.
+    /// How many simple forms of the effect are worth following next to a set: of forms that are limits of each other the best one.
     pub(crate) fn forms_worth_following(self) -> usize {
         1 + usize::from(self.kind.has_unlike_forms())
     }
@@ -143,7 +143,7 @@ impl Part {
             .collect()
     }
 
-    /// By how much it delays a slow motion, if that is what it does \[s\].
+    /// The delay of a slow motion by this effect, if it has one \[s\].
     pub(crate) fn lag_s(&self) -> Option<f64> {
         let lag_s = self
             .variant

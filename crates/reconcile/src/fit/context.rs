@@ -1,4 +1,4 @@
-//! What a fit is given and what it hands back.
+//! Input and result of a fit.
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::position_error::Locking;
@@ -19,19 +19,19 @@ pub(crate) struct Context<'a> {
     /// The base model's gain is free in every fit, the null included: a base fitted to these very records.
     pub free_gain: bool,
     pub white: Option<WhiteEvidence>,
-    /// Error of the standard deviation of a measured noise, in parts of it.
+    /// Relative error of the standard deviation of a measured noise.
     pub floor_error: f64,
-    /// The positions come in steps that are not small beside their increments.
+    /// The positions come in steps that are not small compared with their increments.
     pub quantised: bool,
-    /// What the figures of the search are in the units of the records.
+    /// Figures of the search in the units of the records.
     pub scales: Scales,
 }
 
-/// What the size of the white noise says about averaging in the camera.
+/// The statement of the white noise's size about averaging in the camera.
 ///
-/// With a held command and a bead that follows at once, the path between two commands is straight, and the mean over an
-/// exposure inside that time IS the position in its middle: an exposure Te and a delay Te/2 give the same response. The
-/// Brownian motion tells them apart: averaged over Te it lowers the white part of the noise by `2 D dt Te/(6 dt)`.
+/// With a held command and a bead that follows at once, the path between two commands is straight, and the mean over an exposure
+/// inside that time IS the position in its middle: an exposure Te and a delay Te/2 give the same response. The Brownian motion
+/// separates the two: averaged over Te it lowers the white part of the noise by `2 D dt Te/(6 dt)`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct WhiteEvidence {
     /// Estimated from the records \[um^2\].
@@ -45,7 +45,7 @@ pub(crate) struct WhiteEvidence {
 }
 
 impl WhiteEvidence {
-    /// Squared distance, in standard deviations, between the estimate and what a set of parts leads one to expect.
+    /// Squared distance, in standard deviations, between the estimate and the value that a set of parts predicts.
     pub(crate) fn distance(&self, parts: &[Part], scope: &Scope) -> f64 {
         let exposure_s: f64 = parts.iter().map(|p| p.averages_s(scope)).sum();
         let rows = (exposure_s / scope.sample_s).min(2.0);
@@ -74,7 +74,7 @@ pub(crate) struct Fit {
     pub locking: Vec<Option<Locking>>,
     /// Sum of squares over the mask.
     pub chi2: f64,
-    /// What the last round of the descent gained; nothing once it stands still.
+    /// Gain of the last round of the descent; nothing once it stops.
     pub last_gain: f64,
     /// Innovations that count under the mask.
     pub count: usize,
@@ -100,7 +100,7 @@ impl Fit {
         self.parts.iter().filter(move |p| p.variant().role == role)
     }
 
-    /// Whether a part is a limit of its form: a number of it is at the end of its range, or may be anything in it.
+    /// Whether a part is a limit of its form: one of its numbers is at the end of its range, or may have any value in it.
     pub(crate) fn is_limit(&self, index: usize) -> bool {
         let part = &self.parts[index];
         let before: usize = self.parts[..index].iter().map(|p| p.theta.len()).sum();
@@ -149,8 +149,8 @@ impl Context<'_> {
         poles.iter().any(|p| p.norm() * self.scope.length_s < 1.0)
     }
 
-    /// Whether an effect is no candidate: behind a bare actuator there is neither a chip nor a bead, and a free gain
-    /// is no error; a sensor that counts in steps has no pixels; a constant flow is a number of every fit where the working point is free.
+    /// Whether an effect is no candidate. A bare actuator has neither chip nor bead, and a free gain is no error. A sensor that
+    /// counts in steps has no pixels. A constant flow is a number of every fit if the working point is free.
     pub(crate) fn excludes(&self, id: &str) -> bool {
         let Some(kind) = find(id) else {
             return false;
@@ -163,8 +163,8 @@ impl Context<'_> {
             || self.problem.base.free_working_point && of_flow
     }
 
-    /// The longest delay that is a number of these records \[s\]: a tenth of a second on this rig; of another plant as many rows as
-    /// its slowest lag, at least a hundred, and at most a quarter of a record.
+    /// The longest delay that these records can show \[s\]: a tenth of a second on this rig. On another plant it is as many rows
+    /// as its slowest lag, at least a hundred, at most a quarter of a record.
     pub(crate) fn longest_delay_s(&self) -> f64 {
         const ON_THIS_RIG_S: f64 = 0.1;
         const LEAST_ROWS: f64 = 100.0;

@@ -1,7 +1,7 @@
 //! Joint fit of any set of candidates by Levenberg-Marquardt on the innovations.
 //!
-//! Every fit, that of the null included, also has the linear nuisances: the share of the newest command in a frame,
-//! and (inside the whitening filter) each record's start.
+//! Every fit, that of the null included, also has linear nuisance parameters: the share of the newest command in a frame, and
+//! (inside the whitening filter) each record's start.
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
@@ -10,11 +10,11 @@ use crate::problem::Mask;
 use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
 
-/// Precision with which a weight of a play operator keeps its value in one step of a fit: nothing beside what a record
-/// in which the operator moves has to say. It is no information: a weight that no record moves may be anything.
+/// Precision with which a weight of a play operator keeps its value in one step of a fit. It is negligible if the operator moves
+/// in a record. It is no information: a weight that no record moves may have any value.
 const WEIGHT_PRECISION: f64 = 100.0;
 
-/// A fit stands still when a round gains less than this, or than this part of what it leaves beyond the noise.
+/// A fit ends if a round gains less than this, or than this share of its excess over the noise.
 const STILL: f64 = 0.02;
 const STILL_SHARE: f64 = 3e-6;
 
@@ -28,7 +28,7 @@ const FEWEST: usize = 4;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Until {
     pub iterations: usize,
-    /// It is given up where it will not come below this.
+    /// It is given up if it cannot get below this.
     pub least_chi2: f64,
 }
 
@@ -42,8 +42,8 @@ impl Until {
     }
 }
 
-/// The covariance that goes with an information matrix. A number that the records do not see has none: its variance is infinite, and
-/// it makes no other number less sure.
+/// The covariance of an information matrix. A number that the records do not show has none: its variance is infinite, and it makes
+/// no other number less sure.
 fn covariance(information: &DMatrix<f64>) -> DMatrix<f64> {
     let n = information.nrows();
     let unseen: Vec<usize> = (0..n).filter(|&i| information[(i, i)] <= 0.0).collect();
@@ -63,8 +63,8 @@ fn covariance(information: &DMatrix<f64>) -> DMatrix<f64> {
     inverse
 }
 
-/// Logarithm of the determinant of an information matrix, with what the ranges of its numbers tell of each: a number that may be anything
-/// in a range has the variance `range^2 / 12`.
+/// Logarithm of the determinant of an information matrix, with the information from the ranges of its numbers: a number that may
+/// have any value in a range has the variance `range^2 / 12`.
 fn log_information(mut information: DMatrix<f64>, ranges: &[f64]) -> f64 {
     for (i, range) in ranges.iter().enumerate() {
         information[(i, i)] += 12.0 / (range * range);
@@ -104,7 +104,7 @@ impl Context<'_> {
         self.run(fit.clone(), mask, Until::done(iterations), None)
     }
 
-    /// Carries a fit on with one of its numbers held where it is.
+    /// Continues a fit with one of its numbers fixed.
     pub(crate) fn refit_with(&self, fit: &Fit, mask: &Mask, iterations: usize, held: usize) -> Fit {
         self.run(fit.clone(), mask, Until::done(iterations), Some(held))
     }
@@ -161,7 +161,7 @@ impl Context<'_> {
         self.run(fit, mask, until, None)
     }
 
-    /// Descends; the number `still`, if any, stays where it is.
+    /// Descends; the number `still`, if any, keeps its value.
     fn run(&self, mut fit: Fit, mask: &Mask, until: Until, still: Option<usize>) -> Fit {
         fit.count = self.problem.count(mask);
         let mut state = self.state(&fit, mask);
@@ -175,7 +175,7 @@ impl Context<'_> {
             size = n;
             let (a, mut g) = normal_equations(n, &columns, &state.innovations, mask);
             normal = a;
-            // Operators wider than any swing of the records never move: their weights stay where they are.
+            // Operators wider than any swing of the records never move: their weights keep their values.
             let mut held = normal.clone();
             let mut at = 0;
             for p in &fit.parts {
@@ -226,7 +226,7 @@ impl Context<'_> {
             if improved < STILL.max(STILL_SHARE * rough) {
                 break;
             }
-            // Steps of a descent become smaller: even if they did not, the rest of them would not get there.
+            // The steps of a descent become smaller. Even with steps as large as this one, the remaining ones would not suffice.
             let most = improved * (until.iterations - round) as f64;
             if round >= FEWEST && state.chi2 - most > until.least_chi2 {
                 break;

@@ -7,13 +7,13 @@ use crate::problem::Mask;
 use cellpos_plant::effects::{FitParameter, Role};
 use std::f64::consts::TAU;
 
-/// Step of the numeric derivative by the working point: a tenth of what a loop knows it to \[um\].
+/// Step of the numeric derivative by the working point: a tenth of the uncertainty that a loop has of it \[um\].
 const OFFSET_STEP_UM: f64 = 5e-4;
 
 /// One evaluation of the model.
 pub(crate) struct State {
     pub sim: Vec<Vec<f64>>,
-    /// The same with the lines that shake it: what the pixels see.
+    /// The same with the lines that shake it, as the pixels see it.
     pub path: Vec<Vec<f64>>,
     /// Raw residual, without the share of the edge.
     pub residual: Vec<Vec<f64>>,
@@ -59,7 +59,7 @@ impl Context<'_> {
                 continue;
             }
             let mut e: Vec<f64> = r.y.iter().zip(&*s).map(|(y, s)| y - s).collect();
-            // The noise is told from what is left: the share of the edge is not.
+            // The noise is estimated from the residual; the share of the edge is not.
             for (e, edge) in e.iter_mut().zip(&edges[i]) {
                 *e -= fit.soft * edge;
             }
@@ -200,7 +200,7 @@ impl Context<'_> {
         }
         next += 1;
         if self.free_gain {
-            // The weights of the play operators hold a gain of their own.
+            // The weights of the play operators contain a gain.
             if !fit.parts.iter().any(|p| p.variant().holds_gain()) {
                 for ((columns, sim), r) in columns.iter_mut().zip(&state.sim).zip(records) {
                     if sim.is_empty() {

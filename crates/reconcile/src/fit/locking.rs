@@ -1,11 +1,11 @@
 //! Amplitude, phase and pixel of an error periodic in position, by the exact filter of the position.
 //!
-//! The fit of `evaluate` takes the position for that which the neighbouring rows tell. Those rows carry the error and the
-//! walk themselves: where the slope of the error is some tenths, what is read off them is blurred and bent, and the
-//! amplitude comes out small. Here nothing is linearised: the density of the walk at each row is carried on a grid
-//! (Bucy and Senne 1971, Automatica 7:287, point-mass filter), convolved with the step of the walk, multiplied by the
-//! likelihood `y - a sin(2 pi x/p) - b cos(2 pi x/p)` of the row. The normalising factors are the likelihood of the
-//! record, whose derivatives row by row give the scoring steps and the covariance.
+//! The fit of `evaluate` takes the position from the neighbouring rows. Those rows have the error and the walk in them. If the
+//! slope of the error is some tenths, a value read from them is blurred and bent, and the amplitude becomes too small. Here
+//! nothing is linearised. The density of the walk at each row is carried on a grid (Bucy and Senne 1971, Automatica 7:287,
+//! point-mass filter). It is convolved with the step of the walk and multiplied by the likelihood `y - a sin(2 pi x/p) - b cos(2
+//! pi x/p)` of the row. The normalising factors are the likelihood of the record, whose derivatives row by row give the scoring
+//! steps and the covariance.
 
 use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
@@ -21,7 +21,7 @@ struct Track {
     present: Vec<bool>,
 }
 
-/// Most points of the grid: beyond it one noise is so small beside the other that a filter of this kind is the wrong one.
+/// Most points of the grid. Beyond it one noise is so small compared with the other that this kind of filter is wrong.
 const MOST_POINTS: usize = 600;
 
 /// Grid and tables for one pixel and one pair of noises.
@@ -118,7 +118,7 @@ impl Grid {
                 density.iter_mut().for_each(|d| *d *= scale);
                 mean_um = centre + first * scale;
             } else {
-                // Beyond the window: the bead is looked for anew.
+                // Beyond the window: the bead is searched for again.
                 middle = None;
             }
         }
@@ -126,7 +126,7 @@ impl Grid {
     }
 }
 
-/// Refines part `index` of a fit; `None` where that is no periodic error or the grid would be too large.
+/// Refines part `index` of a fit; `None` if that is no periodic error or the grid would be too large.
 pub(crate) fn refine(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -177,7 +177,7 @@ pub(crate) fn refine(
         0.5,
         0.5,
     ];
-    // One-sided differences: what they are off by goes with the step.
+    // One-sided differences: their error is proportional to the step.
     let steps = reach.map(|r| 2e-3 * r);
     let total = |rows: &[Vec<f64>]| rows.iter().flatten().sum::<f64>();
     let mut now = rows(&x)?;

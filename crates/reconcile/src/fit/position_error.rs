@@ -2,8 +2,8 @@
 
 use nalgebra::{Matrix5, Vector5};
 
-/// What is fitted: `a`, `b`, `ln p`, and the logarithms of both noises, for an error that depends on position looks like
-/// white noise to whoever estimates that without it, and the blur of the positions follows from the noises.
+/// Fitted numbers: `a`, `b`, `ln p`, and the logarithms of both noises. An error that depends on position looks like white noise
+/// to an estimate that ignores it, and the blur of the positions follows from the noises.
 pub(super) type Numbers = Vector5<f64>;
 
 /// An error `a sin(2 pi x/p) + b cos(2 pi x/p)` with the covariance of its [`Numbers`].

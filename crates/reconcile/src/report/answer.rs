@@ -1,4 +1,4 @@
-//! The answer of a report: what the model lacks, and how far the gap falls with it.
+//! The answer of a report: the missing effects, and the fall of the gap with them.
 
 use super::{digits, small};
 use crate::verdict::result::{Effect, Interval, Reconciliation, Verdict};

@@ -56,7 +56,7 @@ fn records(r: &mut Report, result: &Reconciliation) {
     ));
 }
 
-/// What figures of the gap are printed in: nanometres of micrometres, else the unit of the records, and the factor.
+/// Unit of the printed figures of the gap: nanometres for micrometres, else the unit of the records; with the factor.
 fn fine(result: &Reconciliation) -> (f64, &str) {
     match result.gap.unit.as_str() {
         "um" => (1e3, "nm"),
@@ -207,7 +207,7 @@ fn heat(r: &mut Report, name: &str, caption: &str, map: &DiscrepancyMap) {
     ));
 }
 
-/// A probability; below what the search computes it is said to be less.
+/// A probability; one below the search's resolution is printed as a bound.
 fn p_value(p: f64) -> String {
     const LEAST: f64 = 1e-16;
     if p < LEAST {
@@ -354,7 +354,7 @@ fn gap(r: &mut Report, result: &Reconciliation) {
     r.table(t);
 }
 
-/// The figure that answers the question: where the model fell short before, and where it does now.
+/// The figure that answers the question: the gap of the model before and after.
 fn innovations(r: &mut Report, result: &Reconciliation) {
     let g = &result.gap;
     let (factor, unit) = fine(result);

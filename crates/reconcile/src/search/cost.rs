@@ -18,12 +18,13 @@ pub(crate) fn threshold(freedom: usize) -> f64 {
     THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, CHANCE_SD)
 }
 
-/// What the best of so many waves, each with its sine and cosine, must gain: the tail of chi-square with two degrees is `exp(-x/2)`.
+/// Least gain of the best of this number of waves, each with its sine and cosine: the tail of chi-square with two degrees is
+/// `exp(-x/2)`.
 pub(crate) fn threshold_of_waves(tried: usize) -> f64 {
     THRESHOLDS.addition_noise * 2.0 * (tried as f64 / CHANCE).ln()
 }
 
-/// As [`threshold`], for a variant in a problem of so many records.
+/// As [`threshold`], for a variant in a problem of this number of records.
 pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }
@@ -50,8 +51,8 @@ pub(crate) fn surely_left(ctx: &Context<'_>, fit: &Fit) -> f64 {
     (fit.chi2 - noise).max(0.0)
 }
 
-/// Sum of squares that the effects of a set with a choice of equation began from: that beside its delay and its gain, which have one
-/// equation and leave no error of form to be taken for another name.
+/// Sum of squares before the effects of a set that have a choice of equation. The set's delay and gain are already in it: each has
+/// one equation, so it leaves no error of form that could be taken for another name.
 pub(crate) fn before_forms(ctx: &Context<'_>, null: &Fit, fit: &Fit, mask: &Mask) -> f64 {
     let of_one_form =
         |p: &&Part| p.variant.is_gain() || matches!(p.effect(&ctx.scope).act(), Action::Delay(_));
@@ -93,8 +94,8 @@ pub(crate) fn prior_penalty(part: &Part, left: f64) -> f64 {
     beyond * (1.0 + THRESHOLDS.untypical_share / THRESHOLDS.untypical * left)
 }
 
-/// Price of a number beyond the end of a range, which is known to a tenth: minus twice the logarithm of the probability density, over that
-/// at the end. A number a little beyond it costs next to nothing.
+/// Price of a number beyond the end of a range, which is known to a tenth: minus twice the logarithm of the probability density,
+/// relative to the end. A number a little beyond the end costs next to nothing.
 fn beyond((low, high): (f64, f64), x: f64) -> f64 {
     const END_SD: f64 = 0.1;
     let past = match low {

@@ -2,7 +2,7 @@
 
 use crate::fit::context::Context;
 
-/// By how much a search may go beyond its work to weigh the rivals of what it has found.
+/// The factor by which a search may exceed its work to weigh the rivals of its result.
 const BEYOND: f64 = 2.0;
 
 /// How hard to search.

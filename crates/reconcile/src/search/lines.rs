@@ -1,4 +1,4 @@
-//! A line in what is left of a fit, with an amplitude and a phase of its own in every record.
+//! A line in the residual of a fit, with a separate amplitude and phase in every record.
 
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
@@ -111,7 +111,7 @@ fn power(x: &[f64], hz: f64, dt: f64) -> f64 {
     s * s + c * c
 }
 
-/// Whether a series has a line at a frequency: more there than at the neighbours that it can be told from.
+/// Whether a series has a line at a frequency: more there than at the neighbouring frequencies that it can be distinguished from.
 fn stands_out(x: &[f64], hz: f64, dt: f64) -> bool {
     let bin = 1.0 / (x.len() as f64 * dt);
     let peak = [-1.0, -0.5, 0.0, 0.5, 1.0]

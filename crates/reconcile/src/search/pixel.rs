@@ -1,7 +1,7 @@
 //! Looks for an error periodic in the bead's POSITION: pixels of 0.05..1.5 um.
 //!
-//! What a sine of the position gains against the innovations is an inner product, and by the transpose of the whitening
-//! filter it becomes a Fourier transform over the positions: all pixel sizes at once, all records in phase.
+//! The gain of a sine of the position is an inner product with the innovations. The transpose of the whitening filter turns it
+//! into a Fourier transform over the positions: all pixel sizes at once, all records in phase.
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
@@ -133,7 +133,7 @@ fn density(
     density
 }
 
-/// Whitened sine and cosine of a wave number along the positions, and the innovations beside them, of all rows that count.
+/// Whitened sine and cosine of a wave number along the positions, with the innovations, of all rows that count.
 fn columns(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -163,7 +163,7 @@ fn peak(scores: &[f64], from: usize) -> Option<(usize, f64, f64)> {
         .iter()
         .enumerate()
         .max_by(|a, b| a.1.total_cmp(b.1))?;
-    // What else is left over is smooth in the wave number: it must stand out of its neighbourhood as well.
+    // The rest of the residual is smooth in the wave number, so the sine must also exceed its neighbourhood.
     let wide = ((best + from) / 5).max(50);
     let mut around: Vec<f64> =
         scores[best.saturating_sub(wide)..(best + wide).min(scores.len())].to_vec();

@@ -1,7 +1,7 @@
 //! Screening: what would each candidate gain at each of its starting values, without a full fit.
 //!
-//! One simulation per starting value gives a direction in the space of innovations; projected against the tangents of
-//! the present fit it says how much the sum of squares falls when the candidate is scaled best and all else refitted.
+//! One simulation per starting value gives a direction in the space of innovations. Projected against the tangents of the present
+//! fit, it gives the fall of the sum of squares for the best scale of the candidate, with everything else refitted.
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};

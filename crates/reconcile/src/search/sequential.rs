@@ -25,17 +25,17 @@ pub(crate) struct Found {
     pub cut_short: bool,
 }
 
-/// Another candidate in the stead of a named one.
+/// Another candidate in place of a named one.
 #[derive(Debug, Clone)]
 pub(crate) struct Rival {
     pub id: &'static str,
     pub chi2: f64,
     pub part: Part,
-    /// Whether a number of it is at the end of its range, or may be anything in it.
+    /// Whether one of its numbers is at the end of its range, or may have any value in it.
     pub is_limit: bool,
 }
 
-/// Sums of squares so far above that of a fit decide nothing beside it, whatever their prices.
+/// Sums of squares this far above that of a fit decide nothing, whatever their prices.
 fn within(fit: &Fit) -> f64 {
     100.0 + THRESHOLDS.untypical_share * left_over(fit)
 }
@@ -43,8 +43,8 @@ fn within(fit: &Fit) -> f64 {
 /// Whatever is beyond chance, followed to the end.
 pub(crate) const FREELY: [f64; 2] = [0.0, f64::INFINITY];
 
-/// Fits the best leads next to a set and returns the fits, best first; `least` is what a lead must promise, `rival_of` the sum of
-/// squares from which on a fit is followed no further.
+/// Fits the best leads next to a set and returns the fits, best first. `least` is the least gain that a lead must promise. A fit
+/// with a sum of squares above `rival_of` is not continued.
 pub(crate) fn extensions(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -75,7 +75,7 @@ pub(crate) fn extensions(
         })
         .map(|l| l.part)
         .collect();
-    // The best form of each effect, and the second of those with forms that are no limits of each other.
+    // The best form of each effect, and the second best if neither form is a limit of the other.
     let mut seen: Vec<&str> = Vec::new();
     let worth = worth.into_iter().filter(|part| {
         let id = part.id();
@@ -119,8 +119,8 @@ pub(crate) fn extensions(
     fits
 }
 
-/// Every effect of the user's own beside a set, from its best start. Screening is linear, and equations with many numbers look
-/// like nothing from afar: those that a user asks for are few, and are fitted for certain.
+/// Every effect of the user next to a set, from its best start. Screening is linear, so equations with many numbers look like
+/// nothing at first. A user asks for few effects: all are fitted.
 fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&str]) -> Vec<Fit> {
     const SHORT: usize = 6;
     const LONG: usize = 200;
@@ -139,7 +139,7 @@ fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&
     cellpos_numeric::parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
 }
 
-/// Whether the part of `bigger` that `smaller` lacks is worth having, where `null` is what the forms of `smaller` began from.
+/// Whether the part of `bigger` that `smaller` lacks is worth having; `null` is the sum of squares before the forms of `smaller`.
 fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
     let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
     let off_response = bigger
@@ -320,15 +320,15 @@ fn much_left(fit: &Fit) -> bool {
     left_over(fit) > 0.01 * fit.count as f64
 }
 
-/// Whether a set of two or more is on no way to an explanation: with as many effects as may be, each worth what those of the set are on the
-/// average, it would be none. A search takes what is worth most first.
+/// Whether a set of two or more cannot become an explanation. Even with the largest number of effects, each worth the average of
+/// the set, it would explain too little. A search takes the most valuable effects first.
 fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
     let (whole, left, count) = (left_over(null), left_over(fit), fit.parts.len());
     let open = left - (whole - left) / count.max(1) as f64 * most.saturating_sub(count) as f64;
     count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
 
-/// The best single effect and its two rivals; `None` where nothing is worth a name.
+/// The best single effect and its two rivals; `None` if nothing is worth a name.
 fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
     let mut singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
     singles.retain(|f| worth_it(null, f, null.chi2));
@@ -367,7 +367,7 @@ pub(crate) fn search(
         };
     };
     steps.push((ids(&fit), fit.chi2));
-    // What a simple form leaves over must not be given a name of its own before the richer form was tried.
+    // The residual of a simple form must not get a name before the richer form was tried.
     let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, much_left(&fit));
     if reparametrised.parts != fit.parts {
         fit = reparametrised;
@@ -408,7 +408,7 @@ pub(crate) fn search(
         if penalised_cost(ctx, &top) >= penalised_cost(ctx, &fit) {
             break;
         }
-        // A richer form of what is there may explain as well what the next name would stand for.
+        // A richer form of a present effect may explain as much as the next name.
         if top.parts.len() > fit.parts.len() {
             let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, true);
             if reparametrised.parts != fit.parts

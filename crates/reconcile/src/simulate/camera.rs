@@ -3,7 +3,7 @@
 use super::modal::Trace;
 use cellpos_plant::effects::{Block, Piece};
 
-/// What the frames are like.
+/// Properties of the frames.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Frames {
     pub(super) skew: f64,
@@ -76,8 +76,8 @@ pub(crate) fn sample(
     }
     let path = Path::new(t, h, exposure > 0.0);
     let sample_s = h * fine as f64;
-    // A frame so close behind an edge shows what the share of the edge says, as one close before it does: else a delay of
-    // whole frames would be a cliff, and a fit that stands on it takes no step.
+    // A frame that close behind an edge shows the share of the edge, as one that close in front of it does. Otherwise a delay of
+    // whole frames would be a cliff, and a fit on top of it takes no step.
     let whole = near_whole(delay / sample_s).filter(|_| sampling.is_plain());
     let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
     for k in 0..rows {
@@ -103,7 +103,7 @@ pub(crate) fn sample(
     }
 }
 
-/// The whole number of frames that a delay (in frames) is so close to that the frames lie at the edges of the command.
+/// The whole number of frames to which a delay (in frames) is so close that the frames are at the edges of the command.
 pub(crate) fn near_whole(frames: f64) -> Option<usize> {
     const NEAR: f64 = 0.06;
     let whole = frames.round();

@@ -1,21 +1,21 @@
-//! What drives the chain of a record, and how it goes on between the rows.
+//! The inputs of a record's chain, and their course between the rows.
 
 use super::camera::Sampling;
 
-/// What a record's chain is driven by.
+/// The inputs of a record's chain.
 #[derive(Clone, Copy)]
 pub(crate) struct Input<'a> {
     /// Displacement from the working point \[um\].
     pub u: &'a [f64],
     pub sampling: &'a Sampling,
-    /// What carries the bead beside it, as the displacement that does the same \[um\]; empty: nothing.
+    /// Further motion of the bead, as the displacement that has the same effect \[um\]; empty: nothing.
     ///
-    /// What a linear plant makes of it is noise and left out: blocks behind the plant see it, for they act on the flow.
+    /// A linear plant turns it into noise, which is left out. Blocks behind the plant see it, because they act on the flow.
     pub flow_um: &'a [f64],
 }
 
 impl<'a> Input<'a> {
-    /// With nothing beside the displacement.
+    /// Displacement alone.
     pub(crate) fn new(u: &'a [f64], sampling: &'a Sampling) -> Self {
         Self {
             u,

@@ -1,9 +1,8 @@
 //! Fast simulation of the plant with any of the effects at its place, for fitting.
 //!
-//! The equations of the effects are those of `cellpos_plant::effects`, the very same blocks; what differs from
-//! `cellpos_plant::Chain` is the order of the work: a whole record goes through one block after another on an even grid,
-//! one step per sample where that is exact and a finer grid only where a block needs it, so that a minute of record takes
-//! about a millisecond.
+//! The equations of the effects are those of `cellpos_plant::effects`, in the same blocks. Only the order of the work differs from
+//! `cellpos_plant::Chain`: a whole record goes through one block after another on an even grid. Where it is exact, a step is one
+//! sample; a block that needs a finer grid gets one. So a minute of record takes about a millisecond.
 
 mod camera;
 mod input;
@@ -30,7 +29,7 @@ pub(crate) struct Base {
     pub interpolated_input: bool,
     /// The plant need not have rested before a record: its transients are free in every record.
     pub free_start: bool,
-    /// The working point is not known: what an error of it makes is free in every record.
+    /// The working point is not known: the ramp from its error is free in every record.
     pub free_working_point: bool,
 }
 
@@ -44,13 +43,14 @@ impl Base {
 
 /// Simulates a record: displacement from the working point \[um\] in, bead position \[um\] out.
 ///
-/// What the camera shows of a position (lines, pixel locking) is fitted elsewhere: left out here, unless it shows the same
-/// position always alike.
+/// Effects of the camera on a position (lines, pixel locking) are fitted elsewhere. They are left out here, unless the same
+/// position always looks alike.
 ///
-/// `edge`, where asked for, receives the step of the plant's input that acts at the instant of each frame, in parts of
-/// the plant's direct path: what a frame that straddles the edge may already show.
+/// `edge`, if asked for, receives the step of the plant's input at the instant of each frame, in parts of the plant's direct path.
+/// A frame that straddles the edge may already show a share of it.
 ///
-/// Returns how much work it was, in the advances of one mode by one step, or as much: known beforehand, the same on every machine.
+/// Returns the amount of work, in advances of one mode by one step. It is known before the work begins, and the same on every
+/// machine.
 pub(crate) fn simulate(
     base: &Base,
     input: Input<'_>,
@@ -71,8 +71,8 @@ pub(crate) fn simulate(
         chain.run(u, y, edge);
         return work;
     }
-    // A plant that need not have rested had its first command before the record too, as far back as a delay reaches: the response to
-    // the step from rest falls into the start, which is free.
+    // A plant that need not have rested had its first command before the record too, as far back as a delay reaches. So the
+    // response to the step from rest falls into the start, which is free.
     let before = late.min(MOST_BEFORE) as usize;
     let longer: Vec<f64> = std::iter::repeat_n(u[0], before)
         .chain(u.iter().copied())
@@ -222,7 +222,7 @@ impl<'a> Chain<'a> {
                 Stage::Block(_) => blocks += 1,
             }
         }
-        // What goes beside the plant has everything before it once more.
+        // The part next to the plant has everything before it once more.
         for zpk in &self.bypass {
             modes = 2 * modes + zpk.poles.len();
         }
@@ -295,7 +295,7 @@ impl<'a> Chain<'a> {
         camera::sample(&t, (f, self.sampling), h, self.fine, n, y);
     }
 
-    /// Where what flows beside the displacement carries the bead through a plant on whose motion blocks act.
+    /// Whether the bead is also carried by a flow next to the displacement, through a plant on whose motion blocks act.
     fn carried(&self, h: f64) -> Trace {
         let mut t = Trace::default();
         if !self.motion.is_empty() && !self.flow_um.is_empty() {
@@ -328,7 +328,7 @@ impl<'a> Chain<'a> {
         let at = h * (steps - late).min(1.0);
         modal.inside(at, h).run(x, &mut seen);
         let steps = steps as usize;
-        // A frame that close behind an edge shows what the share of the edge says.
+        // A frame that close behind an edge shows the share of the edge.
         let samples = self.frames.delay_s / self.base.sample_s;
         let edge = camera::near_whole(samples)
             .is_some_and(|w| samples < w as f64 && steps == w * self.fine);
@@ -414,7 +414,7 @@ impl<'a> Chain<'a> {
             }
             let behind = Modal::new(&self.plant, h);
             behind.trace(&means, 1, &mut t);
-            // What they let through at once is there before the first command.
+            // Their direct part is there before the first command.
             if let (Some(position), Some(jump)) = (t.pos.first_mut(), t.jump.first_mut()) {
                 *position += behind.direct * rest;
                 *jump -= behind.direct * rest;
@@ -424,7 +424,7 @@ impl<'a> Chain<'a> {
         camera::sample(&t, (self.frames, self.sampling), h, self.fine, n, y);
     }
 
-    /// Blocks on the motion, and what goes beside the plant.
+    /// Blocks on the motion, and the part next to the plant.
     fn behind_plant(&mut self, t: &mut Trace, x: &[f64], pending: &Zpk, h: f64) {
         for block in &mut self.motion {
             camera::advance(t, block.as_mut(), h);
@@ -453,7 +453,7 @@ impl<'a> Chain<'a> {
         if base == 0.0 || direct == 0.0 || averaged {
             return;
         }
-        // Edges lie on the grid of the samples: a delay between samples puts the frames between the edges.
+        // Edges are on the grid of the samples: a delay between samples puts the frames between the edges.
         let Some(shift) = camera::near_whole(self.frames.delay_s / self.base.sample_s) else {
             return;
         };

@@ -1,8 +1,8 @@
 //! A chain of linear blocks under a piecewise-constant input, exactly, as a sum of first-order modes.
 //!
-//! Every linear block of the chain (lag, creep, resonance, relaxation, bubble, leak, the plant) is kept as zeros, poles
-//! and a gain; the product is split into partial fractions once per parameter set, after which a sample costs one
-//! multiply-add per mode. That is what makes thousands of simulations of a minute of record affordable.
+//! Every linear block of the chain (lag, creep, resonance, relaxation, bubble, leak, the plant) is kept as zeros, poles and a
+//! gain. The product is split into partial fractions once per parameter set; then a sample costs one multiply-add per mode. That
+//! makes thousands of simulations of a minute of record affordable.
 
 use cellpos_plant::Zpk;
 use nalgebra::Complex;
@@ -26,7 +26,7 @@ fn separate(poles: &mut [C]) {
                         poles[i] -= C::new(1e-4 * scale, 0.0);
                         moved = true;
                     } else if poles[i].im * poles[j].im > 0.0 {
-                        // Keep conjugate symmetry: shift by a real amount, the conjugate meets its own twin likewise.
+                        // Keep conjugate symmetry: shift by a real amount; the conjugate meets its twin in the same way.
                         poles[i] -= C::new(1e-4 * scale, 0.0);
                         moved = true;
                     }
@@ -47,7 +47,7 @@ struct Mode {
     slope: C,
 }
 
-/// Four first-order modes with states scaled so that the input enters each with weight 1; what is left over of four does nothing.
+/// Four first-order modes with states scaled so that the input enters each with weight 1. Unused modes do nothing.
 #[derive(Debug, Clone, Copy, Default)]
 struct Four {
     /// Decay over a step.
@@ -86,7 +86,7 @@ fn sum(x: [f64; 4]) -> f64 {
     (x[0] + x[1]) + (x[2] + x[3])
 }
 
-/// `(exp(p t) - 1)/p`: what a constant input of 1 has made of a mode after `t`.
+/// `(exp(p t) - 1)/p`: the response of a mode after `t` to a constant input of 1.
 fn driven(p: C, t: f64) -> C {
     let x = p * t;
     if x.norm() < 1e-5 {
@@ -117,7 +117,7 @@ pub(crate) struct Trace {
 }
 
 impl Trace {
-    /// Empty, with room for so many steps.
+    /// Empty, with room for this number of steps.
     fn clear(&mut self, steps: usize) {
         for part in [
             &mut self.pos,
@@ -269,7 +269,7 @@ impl Modal {
 
     /// Positions with jumps and slopes, for what acts on the motion inside a step (adhesion, delay, exposure).
     ///
-    /// `fine` steps make a sample: where the input is held over all of them, the modes go on by whole samples.
+    /// A sample has `fine` steps. If the input is constant over the sample, the modes advance by whole samples.
     pub(super) fn trace(&self, u: &[f64], fine: usize, t: &mut Trace) {
         t.clear(u.len());
         let mut before = 0.0;
@@ -344,7 +344,7 @@ impl Modal {
                 before = u;
             }
         }
-        // The slope at the end of a step is that at the start of the next, without what the next input does at once.
+        // The slope at the end of a step is that at the start of the next, without the immediate effect of the next input.
         let last: f64 = self
             .real
             .iter()
@@ -393,7 +393,7 @@ impl Modal {
 #[derive(Debug, Clone)]
 pub(crate) struct Inside {
     modal: Modal,
-    /// What the input of the step itself has made by then.
+    /// The effect of the step's input by then.
     feed: f64,
 }
 

@@ -177,7 +177,7 @@ fn gap(
     let sigma = ctx.problem.noise.innovation_um();
     let n = null.count as f64;
     let rms = |chi2: f64| sigma * (chi2 / n).max(0.0).sqrt();
-    // The noise of these very rows: what the full fit leaves, where that is the floor within its own error.
+    // The noise of these rows: the residual of the full fit, if it is the floor within its error.
     let in_sample = rms(fit.chi2);
     Gap {
         before: held.before_um,
@@ -198,7 +198,7 @@ fn gap(
     }
 }
 
-/// What every fit moves beside the effects, with its interval.
+/// The numbers that every fit moves in addition to the effects, with their intervals.
 fn base_shift(fit: &Fit, held: &HeldOut) -> BTreeMap<String, Interval> {
     let edge = 1.96 * fit.errors[0];
     let share = Interval {
@@ -212,7 +212,7 @@ fn base_shift(fit: &Fit, held: &HeldOut) -> BTreeMap<String, Interval> {
     ])
 }
 
-/// The search step by step; after the null model, by itself, what a free base gain alone would do.
+/// The search step by step; after the null model, the gain of a free base gain alone.
 fn gap_steps(
     ctx: &Context<'_>,
     null: &Fit,

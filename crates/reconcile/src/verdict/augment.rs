@@ -60,7 +60,7 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
                 .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
                 .sum::<f64>()
                 / rows;
-            // Amplitude and phase are no parameters of the fit: the form of the effect has them beside the frequency.
+            // Amplitude and phase are no parameters of the fit: the form of the effect has them in addition to the frequency.
             part.effect(&ctx.scope)
                 .with_parameter("um", um)
                 .and_then(|e| e.with_parameter("phase_deg", b.atan2(a).to_degrees()))
@@ -88,8 +88,8 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     }
 }
 
-/// Adds what was fitted beside the effects of the base model: a delay to the delay that is there already, a factor to the
-/// factor; of an exposure there is one.
+/// Adds the fitted effects to those of the base model: a delay to the present delay, a factor to the factor. There is only one
+/// exposure.
 fn add(effects: &mut Vec<Effect>, found: Effect) {
     let Some(old) = effects.iter_mut().find(|e| e.id() == found.id()) else {
         effects.push(found);

@@ -1,5 +1,5 @@
-//! What is left after a fit: regressed on a library of terms of command, position, speed and time, each at the two places
-//! at which it may act, to say where and how, and as a formula with its worth on data that it has not seen.
+//! The residual of a fit, regressed on a library of terms of command, position, speed and time, each at both places at which it
+//! may act. The result says where and how, and gives a formula with its worth on data that it has not seen.
 
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
@@ -54,7 +54,7 @@ impl Column {
     }
 }
 
-/// What a term of the library is made of, row by row.
+/// The parts of a library term, row by row.
 struct Row {
     d: f64,
     rate: f64,
@@ -172,8 +172,8 @@ fn sign(x: f64) -> f64 {
     if x == 0.0 { 0.0 } else { x.signum() }
 }
 
-/// Rows of a record with everything that terms are made of. The position is the model's with what the rows before tell of the
-/// walk: with the row itself, or later ones, in it, its own noise would look like an effect.
+/// Rows of a record with everything that terms consist of. The position is the model's plus the walk as the earlier rows show it.
+/// With the row itself or later ones, its own noise would look like an effect.
 fn rows(ctx: &Context<'_>, i: usize, sim: &[f64], residual: &[f64]) -> Vec<Row> {
     let dt = ctx.problem.base.sample_s;
     let r = &ctx.problem.records[i];
@@ -253,8 +253,8 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
     all
 }
 
-/// The term of the library that would gain most beside a fit, everything else refitted: its place in the library, and what
-/// twice the log-likelihood would gain.
+/// The library term with the largest gain in addition to a fit, everything else refitted: its index in the library, and the gain
+/// in twice the log-likelihood.
 pub(crate) fn strongest(
     library: &[Column],
     tangents: &Tangents,
@@ -304,7 +304,7 @@ fn term_of(ctx: &Context<'_>, column: &Column, value: f64) -> Term {
     }
 }
 
-/// Part of a column that must be its own beside the numbers of a base.
+/// Least share of a column that is independent of the numbers of a base.
 const LEAST_OWN: f64 = 1e-4;
 
 /// What a change of gain, stiffness and damping of another plant's base would make, orthonormal on the rows of a mask.
@@ -354,7 +354,7 @@ fn without(column: &[Vec<f64>], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec
     left
 }
 
-/// The columns of a library without what a basis makes of them.
+/// The columns of a library without the part that a basis explains.
 fn beside(library: &[Column], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
     (library.iter())
         .map(|c| without(&c.innovations, basis, mask))
@@ -365,7 +365,7 @@ fn beside(library: &[Column], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<V
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
     let (train, test) = split_in_time(&ctx.problem.records);
     let all = &fit.innovations;
-    // A line first, with an amplitude and a phase of its own in every record.
+    // A line first, with a separate amplitude and phase in every record.
     let line = strongest_line(ctx, fit)
         .and_then(|hz| without_line(ctx, fit, hz, &train))
         .filter(|l| inner(&l.left, &l.left, &test) < inner(all, all, &test) - 10.0);
@@ -387,7 +387,7 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
                 let c = &columns[i];
                 let (cc, ce) = (inner(c, c, &train), inner(c, &left, &train));
                 let own = &library[i].innovations;
-                // What the base's own numbers make as well is none.
+                // A term that the base's own numbers also produce does not count.
                 let seen = cc > LEAST_OWN * inner(own, own, &train);
                 (i, if seen { ce * ce / cc } else { 0.0 })
             })
@@ -399,7 +399,7 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
         trial.push(best);
         let n = trial.len();
         let column = |i: usize| &columns[trial[i]];
-        // Terms of very different units: each in parts of its own size.
+        // Terms of very different units: each scaled by its size.
         let size: Vec<f64> = (0..n)
             .map(|i| {
                 inner(column(i), column(i), &train)

@@ -1,10 +1,10 @@
-//! Small effects that stand for nothing but the form of the large ones beside them.
+//! Small effects that only replace the form of larger ones.
 //!
-//! The catalogue has one equation for an effect, and a rig another. What the two differ by is small beside the effect, and like a
-//! little of something else: a knee like a gain, a drag like a slew limit. Whether a small companion is such a difference is asked
-//! of the large effects themselves: their numbers are let go with command, position, speed and time, at the output and where they
-//! act, spread about their values, and slowed in parts; a curve may bend elsewhere. Where that gains as much as the companion does,
-//! and goes on gaining beside it, the companion is no name.
+//! The catalogue has one equation for an effect, and a rig another. Their difference is small compared with the effect, and looks
+//! like a little of something else: a knee like a gain, a drag like a slew limit. The large effects themselves show whether a
+//! small companion is such a difference. Their numbers may vary with command, position, speed and time, at the output and where
+//! they act; they may be spread about their values, or slower in parts; a curve may bend elsewhere. If that gains as much as the
+//! companion, and still gains when the companion is present, the companion gets no name.
 
 use crate::dot::dot;
 use crate::fit::catalogue::Part;
@@ -26,7 +26,7 @@ pub(crate) struct Aside {
     pub whole: Option<Fit>,
 }
 
-/// Time constants of what is slower in parts, in rows: as far as a decade beyond what the effect remembers.
+/// Time constants of the slower parts, in rows: up to a decade beyond the memory of the effect.
 const SMOOTH_ROWS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 /// How far numbers are spread, in parts of themselves.
 const SPREAD: [f64; 2] = [0.04, 0.12];
@@ -75,8 +75,8 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
     aside
 }
 
-/// Takes all but one out of a set of several that share what one of them, alone and in a freer form, explains as well: none of them
-/// is then small beside the others.
+/// Reduces a set to one effect if that effect alone, in a freer form, explains as much as the set. Within such a set no effect is
+/// small compared with the others.
 fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: usize) {
     let all = ctx.problem.all();
     let gap = left_over(&found.null).max(1e-12);
@@ -116,8 +116,8 @@ fn may_be_form(part: &Part) -> bool {
     variant.role == Role::Chain && !variant.off_response && !part.variant.is_own()
 }
 
-/// Whether part `i` only stands for the form of the parts that are larger: their freer forms gain as much in its stead, and go on
-/// gaining beside it. Of a companion that is real they may be able to imitate much, but leave nothing beside it.
+/// Whether part `i` only replaces the form of the larger parts: their freer forms gain as much without it, and still gain with it.
+/// They may imitate much of a real companion, but gain nothing once it is present.
 fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64]) -> bool {
     let gained = without.chi2 - fit.chi2;
     let larger: Vec<usize> = (0..fit.parts.len())
@@ -133,7 +133,7 @@ fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64])
     first > gained && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
 }
 
-/// What twice the log-likelihood gains by freer forms of some parts of a fit, beyond what chance gives; nothing where they have none.
+/// The gain in twice the log-likelihood by freer forms of some parts of a fit, beyond chance; None if they have no such forms.
 pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> f64 {
     let free = freer(ctx, fit, parts);
     if free.first().is_none_or(Vec::is_empty) {
@@ -142,8 +142,7 @@ pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> f6
     gained_beside(ctx, fit, free)
 }
 
-/// Whether a part is a hysteresis of which a curve without memory in front of the plant, any, gains as good as all beside the
-/// others.
+/// Whether a part is a hysteresis that some curve without memory in front of the plant explains as well.
 pub(crate) fn remembers_nothing(
     ctx: &Context<'_>,
     part: &Part,
@@ -154,7 +153,7 @@ pub(crate) fn remembers_nothing(
         && gained_beside(ctx, without, bends(ctx)) > THRESHOLDS.curve_share * gained
 }
 
-/// What twice the log-likelihood would gain by columns beside a fit, its numbers free as well, beyond what chance gives.
+/// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.
 fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>) -> f64 {
     let mut columns = ctx.tangents(fit, &ctx.problem.all()).columns;
     let own = gain_of(&columns, &fit.innovations);
@@ -222,7 +221,7 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
     out
 }
 
-/// Places of the command's range, in parts of it, at which a curve may bend.
+/// Places in the command's range, as shares of it, at which a curve may bend.
 const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
 
 /// Innovations by record and column of a curve in front of the plant that bends at places of the command's range.
@@ -310,7 +309,7 @@ fn let_go(
     out
 }
 
-/// What twice the log-likelihood gains when all columns are fitted to innovations; each in parts of its own size.
+/// The gain in twice the log-likelihood when all columns are fitted to innovations, each scaled by its size.
 fn gain_of(columns: &[Columns], e: &[Vec<f64>]) -> f64 {
     let n = columns
         .iter()

@@ -76,7 +76,7 @@ pub fn looks_like_volts(records: &[Record], working_point_um: f64) -> bool {
     low >= -0.5 && high <= 10.5 && (0.5 * (low + high) * 4.0 / working_point_um - 1.0).abs() < 0.5
 }
 
-/// What the working point says about the command's unit.
+/// The statement of the working point about the command's unit.
 pub(crate) fn working_point(
     records: &[Record],
     working_point_um: f64,
@@ -99,9 +99,9 @@ pub(crate) fn working_point(
     Ok(())
 }
 
-/// Whether the motion goes with the command as the model says, at any gain and any delay up to 20 samples; judged by the
-/// innovations of a bead, and by the positions themselves, which a strong nonlinearity leaves more alike. Of another plant, whose
-/// model may come from these very records, it is no error but what there is to say of them.
+/// Whether the motion follows the command as the model says, at any gain and any delay up to 20 samples. A bead is judged by its
+/// innovations, and by its positions, which a strong nonlinearity changes less. For another plant, whose model may come from these
+/// records, a mismatch is no error but the result.
 pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError> {
     let problem = ctx.problem;
     let sim = ctx.simulated(&[], 0.0, &problem.all());
@@ -195,7 +195,7 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError
     })
 }
 
-/// What a gain says of the units of a bead's records.
+/// The statement of a gain about the units of a bead's records.
 fn of_a_bead(gain: f64) -> Result<(), ReconcileError> {
     let units = |what, hint| {
         Err(ReconcileError::Units {
@@ -231,7 +231,7 @@ fn of_a_bead(gain: f64) -> Result<(), ReconcileError> {
     Ok(())
 }
 
-/// Of another plant nothing is known of its units but what the model has.
+/// Of another plant's units only those of its model are known.
 fn of_other_data(gain: f64) -> Result<(), ReconcileError> {
     if (0.3..=3.0).contains(&gain) {
         return Ok(());

@@ -1,5 +1,5 @@
-//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms), and the end of the time by its beginning
-//! and the beginning by the end: what is at work in one part of a record alone is seen there alone.
+//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms), then the end of the time by its
+//! beginning and the reverse. An effect that acts in one part of a record alone is visible only there.
 
 use crate::fit::context::{Context, Fit};
 use crate::problem::{Mask, Prepared, split_from_the_end, split_in_time};
@@ -14,15 +14,15 @@ pub(crate) struct HeldOut {
     pub before_um: f64,
     /// RMS innovation of the set, fitted without the record \[um\].
     pub after_um: f64,
-    /// RMS of the free run's error, likewise: without level, transients, and, for a plant that integrates, a ramp \[um\].
+    /// The same for the RMS of the free run's error: without level, transients, and, for a plant that integrates, a ramp \[um\].
     pub free_before_um: f64,
     /// The same of the set \[um\].
     pub free_after_um: f64,
-    /// What the walk and the white noise alone are expected to make of it \[um\].
+    /// The value expected from the walk and the white noise alone \[um\].
     pub free_floor_um: f64,
     pub per_record: Vec<RecordGap>,
-    /// Parts that do not help in the last 40 % and in the first 40 % of the time together, each when fitted on the rest, or that one of the
-    /// two speaks against.
+    /// Parts that do not help in the last 40 % and the first 40 % of the time together, each when fitted on the rest, or that one
+    /// of the two contradicts.
     pub unconfirmed: Vec<usize>,
     /// How far a free base gain moves when it is refitted together with the set.
     pub gain_shift: Interval,
@@ -54,7 +54,7 @@ impl Sums {
     }
 }
 
-/// Free-run error on the rows of a mask: energies before and after, what the noise is expected to make, and rows.
+/// Free-run error on the rows of a mask: energies before and after, energy expected from the noise, and number of rows.
 fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
     let ramp = ctx.integrates();
     let noise = &ctx.problem.noise;
@@ -210,14 +210,14 @@ fn unconfirmed(
     failed.map(|(i, _)| i).collect()
 }
 
-/// Twice the negative logarithm of the probability of the rows that `some` was not fitted to, given those that it was: over all values that
-/// these leave possible for its numbers (Laplace's approximation). A number that the one part of a record leaves open predicts nothing of
-/// the other, and nothing against it.
+/// Twice the negative logarithm of the probability of the held-out rows, given the fitted rows. It is over all values that the
+/// fitted rows leave possible for the numbers of `some` (Laplace's approximation). A number that one part of a record leaves open
+/// predicts nothing of the other, and nothing against it.
 fn surprise(all: &Fit, some: &Fit) -> f64 {
     all.chi2 - some.chi2 + all.log_information - some.log_information
 }
 
-/// Refits with a free gain beside the set (or alone) and says how far it moves from 1.
+/// Refits with a free gain in addition to the set (or alone) and returns its change from 1.
 fn gain_shift(ctx: &Context<'_>, fit: &Fit) -> Interval {
     let unit = String::new();
     if ctx.free_gain {

@@ -1,4 +1,4 @@
-//! The verdict: what a set of effects must show before its names are given, and what is said where it does not.
+//! The verdict: the conditions under which a set of effects gets its names, and the sentence if it does not.
 
 use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
@@ -32,7 +32,7 @@ pub(crate) struct Evidence<'a> {
     pub counted: bool,
     /// The search ended with its budget.
     pub cut_short: bool,
-    /// And before other effects were tried in the stead of those that it found.
+    /// And before other effects were tried in place of those found.
     pub unweighed: bool,
     /// What is said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
@@ -62,7 +62,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let all = ctx.problem.all();
     let library = battery::library(ctx, e.fit);
     let strongest = battery::strongest(&library, &ctx.tangents(e.fit, &all), e.fit, &all);
-    // A term counts where it is beyond chance and beyond what equations that differ in their last digits leave.
+    // A term counts if it is beyond chance and beyond the residual of equations that differ in their last digits.
     let gained = (e.null.chi2 - e.fit.chi2).max(0.0);
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
@@ -119,7 +119,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         return out;
     }
     let remains = remains || moved.is_some();
-    // One of several names, beside a remainder: only if the set is whole but for the last digits of its equations.
+    // One of several names, next to a remainder: only if the set is complete but for the last digits of its equations.
     let least = match (e.cut_short, e.names.ambiguous) {
         (true, _) => THRESHOLDS.cut_closed,
         (false, true) => THRESHOLDS.closed_whole,
@@ -160,7 +160,7 @@ fn no_name(fit: &Fit, words: &str) -> String {
     )
 }
 
-/// Why a set is no name, if it is none.
+/// The reason why a set gets no name, if it gets none.
 fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Option<String> {
     let best = ids(e.fit).join(" + ");
     if !e.floor.source.is_known() {
@@ -175,7 +175,8 @@ fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Opti
             "the best of the catalogue is {best}, but the search ended with its budget before others were tried in its stead: no name"
         ));
     }
-    // Beside a model that is none of these records nothing of the catalogue is missing; equations of the user's own may stand for it.
+    // If the model does not describe these records at all, nothing of the catalogue is missing; the user's equations may stand for
+    // it.
     if e.unlike.is_some() && e.fit.parts.iter().all(|p| !p.variant.is_own()) {
         return Some(format!(
             "the best of the catalogue, {best}, is no name beside a model that these records do not follow"
@@ -198,8 +199,8 @@ fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Opti
         .map(|words| no_name(e.fit, &words))
 }
 
-/// Of another plant: a single term of the library that explains as much as several effects together. A curved characteristic is not
-/// missing from the catalogue's list of parts because several of them bend like it.
+/// For another plant: a single library term that explains as much as several effects together. A curved characteristic is not
+/// missing from the catalogue only because several effects bend in the same way.
 fn one_term(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
     if !ctx.problem.base.free_start || e.fit.parts.len() < 2 {
         return None;
@@ -282,11 +283,11 @@ pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, Str
     None
 }
 
-/// A name must help on data that was not fitted, in innovations and, where its effect is beyond what the walk makes, in free run.
+/// A name must help on data that was not fitted: in innovations and, if its effect is larger than the walk, in free run.
 fn not_earned(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
     let of_other_data = ctx.problem.base.free_start;
     let (before, after) = (e.held.free_before_um, e.held.free_after_um);
-    // The walk's own scatter is as large as itself. What a zero flow makes is nearly one curve of one size: 3.3 standard deviations of
+    // The scatter of the walk is as large as the walk. A zero flow makes nearly one curve of one size: 3.3 standard deviations of
     // one number are one in a thousand.
     let times = match ctx.problem.noise.zero_flow {
         Some(_) => 3.3,
@@ -294,7 +295,8 @@ fn not_earned(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
     };
     let floor = times * e.held.free_floor_um;
     let falls = after <= (1.0 - THRESHOLDS.free_run_fall) * before;
-    // The walk is the same in both: whatever its size, a base that was fitted to the records does not run worse with what it lacks.
+    // The walk is the same in both. So whatever its size, a base that was fitted to the records does not run worse with the
+    // missing effect.
     let grows = of_other_data && after > (1.0 + THRESHOLDS.free_run_fall) * before;
     if grows || (before > floor && after > floor && !falls) {
         return Some(format!(
@@ -344,7 +346,7 @@ fn describe(
     out.hypothesis = battery::hypothesis(ctx, fit, library);
 }
 
-/// What is left beside names that stand.
+/// The remainder next to the names.
 fn remainder(
     ctx: &Context<'_>,
     e: &Evidence<'_>,

@@ -31,7 +31,7 @@ pub struct Cell {
     pub floor_um: f64,
     /// Excess over the floor in standard deviations of the noise's own scatter.
     pub z: f64,
-    /// Whether it is beyond what the whole map would show by chance once in twenty times.
+    /// Whether the excess is larger than the whole map would show by chance once in twenty times.
     pub flagged: bool,
 }
 
@@ -64,8 +64,8 @@ impl DiscrepancyMap {
 
 fn cell(energy: f64, n: f64, sigma_um: f64, slack: f64, limit: f64) -> Cell {
     let n = n.max(1.0);
-    // The floor itself is known to about one percent: an excess below that is none.
-    // Wilson-Hilferty: a band of few bins is far from normal.
+    // The floor is known to about one percent: a smaller excess does not count. Wilson-Hilferty: a band of few bins is far from
+    // normal.
     let spread = 2.0 / (9.0 * n);
     let z =
         ((energy / n).max(0.0).cbrt() - (1.0 - spread)) / (spread + (slack / 3.0).powi(2)).sqrt();

@@ -40,7 +40,7 @@ pub(crate) struct Names {
     pub curvature: bool,
 }
 
-/// Ids that explain the records as well in the stead of part `index`, and whether a record could tell them from it.
+/// Ids that explain the records as well in place of part `index`, and whether a record could separate them from it.
 fn alternatives(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -61,8 +61,8 @@ fn alternatives(
             let distance = |parts: &[Part]| w.distance(parts, &ctx.scope);
             distance(&other) - distance(&fit.parts) > THRESHOLDS.tie
         });
-        // A richer form that only holds the winner as a limit of its numbers is no rival; one as simple is, however
-        // unusual its size, unless what is left over says that the last percent decides nothing.
+        // A richer form that only contains the winner as a limit of its numbers is no rival. A form as simple is one, however
+        // unusual its size, unless the residual shows that the last percent decides nothing.
         let richer = r.part.theta.len() > part.theta.len();
         if richer && r.is_limit {
             continue;
@@ -78,7 +78,7 @@ fn alternatives(
             found.push(r.id.to_owned());
         }
     }
-    // What nothing tells apart is both, as long as the form is the plain one of both.
+    // If nothing separates two names, both are given, as long as both have their plain form.
     let same = effects::find(id).map_or(&[][..], |k| k.spec().inseparable_from);
     for other in same {
         if part.variant().params.len() == 1 && !found.iter().any(|x| x == other) {

@@ -6,8 +6,8 @@ use crate::verdict::result::Interval;
 use cellpos_plant::effects::{self, FitParameter, Role};
 use std::collections::BTreeMap;
 
-/// Relative error of a parameter that no length of record takes away: two integrators of the same equations, a commanded edge
-/// in one and in the other, agree to about a thousandth (two of these).
+/// Relative error of a parameter that no length of record reduces: two integrators of the same equations that take an edge of the
+/// command differently agree to about a thousandth (two of these).
 const NUMERIC: f64 = 5e-4;
 
 /// That error in the fit's coordinates.
@@ -110,7 +110,7 @@ fn tell(ctx: &Context<'_>, part: &Part, interval: &mut Interval) {
     }
 }
 
-/// A value with so many standard deviations about it as make 95 %.
+/// A value with the standard deviations about it that cover 95 %.
 fn about(value: f64, sd: f64, unit: &str) -> Interval {
     Interval {
         value,

@@ -1,7 +1,7 @@
 //! How far a number may go before the records speak against it: the profile of the likelihood, all other numbers fitted again.
 //!
-//! Two numbers of which the records tell little more than the ratio lie on a curved ridge. The ellipse of the curvature at the best
-//! place touches it there and nowhere else.
+//! If the records fix little more than the ratio of two numbers, the likelihood is a curved ridge. The ellipse of the curvature at
+//! the best place touches it there and nowhere else.
 
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::verdict::parameters::SURE;
@@ -9,13 +9,13 @@ use cellpos_plant::effects::Role;
 
 /// Steps towards an end.
 const STEPS: usize = 4;
-/// An end is found where the likelihood has fallen as far as it should, to so many parts of it: a twentieth of a standard deviation.
+/// An end is found if the likelihood has fallen by the required amount, to this share of it: a twentieth of a standard deviation.
 const NEAR: f64 = 0.05;
 /// Rounds of a fit with a number held.
 const ROUNDS: usize = 5;
 
-/// Ends of the 95 % interval of every number of a set, in the fit's coordinates; `None` where a number has no profile (a weight, a line,
-/// one that no record sees). `wide` is by how many times each is less sure than the likelihood says.
+/// Ends of the 95 % interval of every number of a set, in the fit's coordinates. `None` for a number without a profile: a weight,
+/// a line, one that no record shows. `wide` is the factor by which each is less sure than the likelihood says.
 pub(crate) fn ends(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -65,7 +65,7 @@ struct Number {
 }
 
 impl Number {
-    /// Where the root of what the likelihood has fallen by is `limit`, on the side of `sd`.
+    /// The place on the side of `sd` at which the root of the likelihood's fall is `limit`.
     fn end(self, ctx: &Context<'_>, fit: &Fit, sd: f64, limit: f64) -> f64 {
         let part = &fit.parts[self.index];
         let p = &part.variant().params[self.j];
@@ -81,7 +81,7 @@ impl Number {
             if (fallen - limit).abs() < NEAR * limit || (fallen < limit && to != x + moved) {
                 return to;
             }
-            // A line through this place and the best one, or, beyond the end, the last on this side of it.
+            // A line through this place and the best one; beyond the end, the last one on this side.
             let (a, f) = if fallen > limit { near } else { (to, fallen) };
             let (b, g) = if fallen > limit { (to, fallen) } else { near };
             let slope = (g - f) / (b - a);

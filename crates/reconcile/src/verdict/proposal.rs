@@ -30,8 +30,8 @@ const WRITTEN: &[(&str, &str)] = &[
     ("t", "time"),
 ];
 
-/// The effects that a hypothesis proposes: what goes into the plant, and what comes out of it. Lines are none: they have no
-/// equation in the command, and `mains-hum` is in the catalogue.
+/// The effects that a hypothesis proposes: terms at the plant's input and at its output. Lines are left out: they have no equation
+/// in the command, and `mains-hum` is in the catalogue.
 pub(crate) fn of(ctx: &Context<'_>, hypothesis: &Hypothesis) -> Vec<Definition> {
     [("input", Site::Chip), ("output", Site::Plant)]
         .into_iter()
@@ -68,7 +68,7 @@ fn parameter(name: &str, unit: &str, bound: f64, start: f64) -> UserParameter {
 }
 
 fn definition(ctx: &Context<'_>, site: Site, terms: &[&Term]) -> Definition {
-    /// So many times what the regression says: it is a first step from a model without the effect.
+    /// Multiple of the regression's value: it is a first step from a model without the effect.
     const ROOM: f64 = 20.0;
     let mut parameters = Vec::new();
     let mut output = if site == Site::Chip {
@@ -92,7 +92,7 @@ fn definition(ctx: &Context<'_>, site: Site, terms: &[&Term]) -> Definition {
         let per = ctx.scope.stroke_um / ctx.scope.travel_um.max(1e-12);
         let (stiffness, of_stiffness) = ctx.scales.coefficient(per, Side::Input, [0, 1, 0]);
         add("gain", "", "input", 0.5, 0.0);
-        // A plant of one lag has two numbers, and a gain beside them would leave none of them certain.
+        // A plant of one lag has two numbers. With a gain in addition, none of the three would be certain.
         let poles = &ctx.problem.base.zpk.poles;
         if !has("y") && !poles.is_empty() {
             add("stiffness", &of_stiffness, "position", stiffness, 0.0);

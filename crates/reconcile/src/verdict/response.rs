@@ -1,11 +1,11 @@
 //! Measured over simulated response, by a method that is right in open and in closed loop.
 //!
-//! In a loop the command answers the noise that has moved the bead, and the spectrum of the position over that of the command is
-//! in part that of noise over its answer (Ljung, System Identification, 2nd ed., 13.4). Here the joint input-output method is
-//! taken: the noise is what neither the past nor the simulated motion explains (a causal regression, which feedback does not
-//! bias because a frame shows commands of its past alone); the part of the simulated motion that answers this noise is taken
-//! out; and what is left, which is what reference and excitation have driven, is the instrument. Without a loop nothing is taken
-//! out, and the ratio is the usual one.
+//! In a loop the command answers the noise that has moved the bead. So the spectrum of the position over that of the command is in
+//! part that of noise over its answer (Ljung, System Identification, 2nd ed., 13.4). Here the joint input-output method is used.
+//! The noise is the part that neither the past nor the simulated motion explains: a causal regression, which feedback does not
+//! bias because a frame shows only earlier commands. The part of the simulated motion that answers this noise is removed. The rest
+//! was driven by reference and excitation: it is the instrument. Without a loop nothing is removed, and the ratio is the usual
+//! one.
 
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
@@ -24,8 +24,8 @@ pub struct BandRatio {
     pub phase_deg: f64,
     /// Standard error of the ratio, in parts.
     pub error: f64,
-    /// Part of the motion in the band that was driven from outside the loop, beside what noise does: near 1 where the band was
-    /// excited beyond the noise, near 0 where nothing but noise, and in a loop the command that answers it, moved the bead.
+    /// Share of the motion in the band that was driven from outside the loop and not by noise. It is near 1 if the band was
+    /// excited beyond the noise. It is near 0 if only noise moved the bead, and in a loop the command that answers it.
     pub coherence: f64,
 }
 
@@ -243,7 +243,7 @@ mod tests {
         for k in 0..n {
             external = 0.85 * external + drive * w[k];
             if k > 0 {
-                // The whitened position of the step before, three samples' worth of it.
+                // The whitened position of the previous step: three samples.
                 answer = 0.7 * answer - 0.35 * (gain * s[k - 1] + v[k - 1]);
             }
             s[k] = external + answer;

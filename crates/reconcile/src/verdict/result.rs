@@ -1,4 +1,4 @@
-//! What the workflow hands back: verdict, effects, where, gap, and what a report needs.
+//! The result of the workflow: verdict, effects, places, gap, and the data of a report.
 
 use crate::data::floor::FloorSource;
 use crate::data::noise::NoiseModel;
@@ -16,11 +16,11 @@ use std::collections::BTreeMap;
 pub enum Verdict {
     /// Effects are named; alternatives that no record of command and position can tell apart are listed with them.
     Named,
-    /// Effects are named and hold on their own, and something remains beside them: see [`Reconciliation::remainder`].
+    /// Effects are named and hold, and something remains: see [`Reconciliation::remainder`].
     NamedWithRemainder,
     /// The data cannot separate the named effect from its alternatives; `separate_by` says what would.
     Ambiguous,
-    /// Beyond the floor, and nothing in the catalogue closes enough of it.
+    /// Beyond the floor, and nothing in the catalogue closes enough of the gap.
     Unknown,
     /// At the floor.
     NothingMissing,
@@ -91,13 +91,13 @@ pub struct Effect {
     pub separate_by: Option<String>,
 }
 
-/// What is left beside the named effects.
+/// The remainder next to the named effects.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Remainder {
     /// Where it shows.
     #[serde(rename = "where")]
     pub places: Vec<String>,
-    /// What it is like, in words.
+    /// A description in words.
     pub how: String,
     /// Part of the excess over the floor that is left, 0..1.
     pub share: f64,
@@ -154,17 +154,17 @@ pub struct Gap {
     pub before: f64,
     /// Augmented model, on held-out records.
     pub after: f64,
-    /// Noise alone; where [`Reconciliation::floor`] is unknown, what the fit leaves.
+    /// Noise alone; if [`Reconciliation::floor`] is unknown, the residual of the fit.
     pub floor: f64,
     /// RMS error of the free run of the null model on held-out records, without its start.
     pub free_run_before: f64,
     /// The same of the augmented model.
     pub free_run_after: f64,
-    /// What noise alone is expected to make of it.
+    /// The value expected from noise alone.
     pub free_run_floor: f64,
     /// Unit of all figures of the gap.
     pub unit: String,
-    /// What they are.
+    /// The quantity of these figures.
     pub quantity: &'static str,
     /// The search, step by step, on all records.
     pub steps: Vec<GapStep>,
@@ -197,7 +197,7 @@ pub struct Trace {
     pub measured_um: Vec<f64>,
     /// Null model, carried along with the measured position by its own filter \[um\].
     pub before_um: Vec<f64>,
-    /// Augmented model, likewise \[um\].
+    /// The same for the augmented model \[um\].
     pub after_um: Vec<f64>,
     /// Free-run residual of the null model \[um\].
     pub residual_before_um: Vec<f64>,
@@ -266,14 +266,14 @@ pub struct Reconciliation {
     pub places: Vec<String>,
     /// How far apart before and after.
     pub gap: Gap,
-    /// How far base parameters move beside the effects: a free gain (1 = not at all), and the share of a command's
-    /// direct path that the frame at its edge already shows.
+    /// Change of base parameters in addition to the effects: a free gain (1 = not at all), and the share of a command's direct
+    /// path that the frame at its edge already shows.
     pub base_shift: BTreeMap<String, Interval>,
     /// A formula for what no effect explains.
     pub hypothesis: Option<Hypothesis>,
     /// The same as effects of the user's own, to be edited and run again; without lines.
     pub proposal: Vec<Definition>,
-    /// What is left beside the named effects.
+    /// The remainder next to the named effects.
     pub remainder: Option<Remainder>,
     /// Where the noise floor comes from.
     pub floor: FloorSource,
@@ -283,8 +283,8 @@ pub struct Reconciliation {
     pub sample_s: f64,
     /// The model with the effects added.
     pub augmented: Model,
-    /// The model with the best set that was found, whatever the verdict says of its names: where that is `unknown`, equations
-    /// that predict without being shown to be true.
+    /// The model with the best set found, whatever the verdict says of its names. If the verdict is `unknown`, its equations
+    /// predict, but are not shown to be true.
     pub best: Model,
     /// Map of the null model.
     pub before: DiscrepancyMap,

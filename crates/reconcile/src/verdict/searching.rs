@@ -1,4 +1,4 @@
-//! The search under the noise that goes with what it finds: a floor that a better fit lowers, a zero flow that moves.
+//! The search under noise that depends on its results: a floor that a better fit lowers, a zero flow that moves.
 
 use crate::data::coloured::NoiseKind;
 use crate::data::floor::{Floor, error_of, refined};
@@ -102,8 +102,8 @@ impl Searching<'_> {
 
     /// Searches under the noise of the rig: a zero flow that moves, or, if that is more probable, one that stands still.
     ///
-    /// In a closed loop a zero flow and a slow effect of the response explain much the same motion, and the zero flow is always there.
-    /// So the search begins beside it. Each set gives another estimate of it, until that settles.
+    /// In a closed loop a zero flow and a slow effect of the response explain much the same motion, and the zero flow is always
+    /// there. So the search begins with one. Each set gives another estimate of it, until that settles.
     pub(super) fn under_noise(
         &self,
         problem: Problem,
@@ -144,7 +144,7 @@ impl Searching<'_> {
         let problem = problem.with_noise(noise);
         let start = Some(moving.found.fit.clone());
         let still = self.search(problem, floor, effort, start, &mut *progress);
-        // What is there beside a zero flow that moves is there without: else a leak may stand for both.
+        // An effect that is found next to a moving zero flow is there without one, too: else a leak may stand for both.
         let keeps = moving
             .found
             .fit
@@ -160,7 +160,7 @@ impl Searching<'_> {
 
     /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
-        /// A path gains half of what the one before it did.
+        /// A path gains half as much as the previous one.
         const MOST_PATHS: usize = 12;
         let residual = |problem: &Problem, fit: &Fit| self.context(problem, 0).residual(fit).0;
         let weighed = |problem: Problem, fit: &Fit| {

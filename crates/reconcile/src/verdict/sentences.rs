@@ -122,7 +122,7 @@ fn course(thirds: &[MapRow]) -> Option<String> {
     if let [a, _, c] = excess[..] {
         let most = a.max(c);
         if most > 0.0 {
-            // Less than a thousandth is none: a ratio to it would be one to noise.
+            // Less than a thousandth counts as zero: a ratio to it would be a ratio to noise.
             let next_to_none = |part: f64, of: f64| part < 1e-3 * of;
             return Some(if a > 0.5 * c && c > 0.5 * a {
                 "from the start and evenly in time".to_owned()

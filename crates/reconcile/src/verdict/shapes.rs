@@ -1,7 +1,7 @@
 //! Shapes of one effect: equations under one name and with the same numbers that the records may not tell apart.
 //!
-//! The shape is one more number of the fit. An interval is over all shapes: what any of them allows, each by what the likelihood has
-//! left for it.
+//! The shape is one more number of the fit. An interval covers all shapes: the values that each allows, within the likelihood that
+//! its own fit leaves.
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};

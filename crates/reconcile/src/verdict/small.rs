@@ -1,10 +1,10 @@
-//! Effects so small beside the large ones that the search passes them by: looked for last, and asked hardest.
+//! Small effects next to large ones, which the search leaves out: looked for last, under the strictest conditions.
 //!
-//! What explains a thousandth of the gap may be the difference between the catalogue's equation of a large effect and the rig's, so
-//! the search asks for more (`addition_share`). A slow creep beside a delay explains no more either, and spoils the free run all the
-//! same. At the end the two can be told apart: where the small one is real, nothing is left that freer forms of the large ones
-//! could take up; where it only stands for their form, they go on gaining beside it. Beside large ones whose form is known to be
-//! another, since something was set aside, nothing small is looked for.
+//! An effect that explains a thousandth of the gap may be the difference between the catalogue's equation of a large effect and
+//! the rig's. So the search asks for more (`addition_share`). But a slow creep together with a delay explains no more either, and
+//! yet spoils the free run. At the end the two cases can be separated. If the small effect is real, freer forms of the large ones
+//! have nothing left to take up. If it only replaces their form, they gain in addition to it. If something was set aside, the form
+//! of the large effects is known to differ, and nothing small is looked for.
 
 use crate::fit::context::{Context, Fit};
 use crate::search::cost::{before_forms, penalised_cost, prior_penalty, threshold};
@@ -16,7 +16,7 @@ use crate::verdict::{form, held_out, judge, split};
 /// Leads that are followed to the end.
 const LEADS: usize = 3;
 
-/// Adds what is left beside a set and stands on its own, one after another.
+/// Adds the small effects that hold next to a set, one after another.
 pub(crate) fn add(
     ctx: &Context<'_>,
     found: &mut Found,
@@ -37,7 +37,7 @@ pub(crate) fn add(
             return;
         }
         let (fit, rivals) = settle(ctx, top.clone(), None, &all, effort);
-        // What was named before stands, and there was work left to weigh it all.
+        // All names so far hold, and there was work left to weigh everything.
         if rivals.len() < fit.parts.len() || !top.parts.iter().all(|p| fit.has(p.id())) {
             return;
         }
@@ -46,7 +46,7 @@ pub(crate) fn add(
     }
 }
 
-/// Whether the last part of a set that is one larger than what was found is an effect of its own: the cheap questions first.
+/// Whether the last part of an enlarged set is a separate effect: the cheap questions first.
 fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: usize) -> bool {
     let large = found.fit.parts.len();
     let part = &top.parts[large];

@@ -55,10 +55,10 @@ fn moving(ctx: &Context<'_>) -> Vec<Group> {
         .collect()
 }
 
-/// By how much the numbers of a set scatter between the records, in parts of what their uncertainties make of it, at least 1: the
-/// Birge ratio (Birge 1932, Phys. Rev. 40:207) of each number of each part. An equation that is not quite the rig's fits each
-/// excitation with another number, and is less sure than the curvature of the joint fit says. Of one record, between its halves: a record
-/// that is cut in two says the same.
+/// Scatter of a set's numbers between the records, over the scatter that their uncertainties predict, at least 1: the Birge ratio
+/// (Birge 1932, Phys. Rev. 40:207) of each number of each part. An equation that is not quite the rig's gets another number from
+/// each excitation. So the number is less sure than the curvature of the joint fit says. A single record is compared between its
+/// halves: a record that is cut in two gives the same.
 pub(crate) fn birge(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<f64> {
     let numbers: usize = fit.parts.iter().map(|p| p.theta.len()).sum();
     let mut groups = moving(ctx);

@@ -56,7 +56,7 @@ impl Reconciliation {
         if let Some(edge) = self.base_shift.get_mut("frame_edge_share") {
             let per = input / output;
             (edge.value, edge.ci95) = (edge.value * per, edge.ci95.map(|v| v * per));
-            // Of one name: a pure number that is told as such.
+            // One name: a pure number that is reported as such.
             edge.unit = format!("{}/{}", scales.output_unit(), scales.input_unit());
         }
     }

@@ -1,12 +1,12 @@
-//! What is said of records of another plant that hardly go with their model: a sensor without a sign is told by its turns.
+//! Records of another plant that hardly agree with their model. The turns of a sensor without a sign show it.
 
 use crate::problem::Prepared;
 
 /// Part of the motion that the size of the model's output must explain before a rectifier is spoken of.
 const WITHOUT_SIGN: f64 = 0.2;
 
-/// The same, of the curvature that is left where the output is unfolded: below this it turns sharply at its lowest and nowhere
-/// else. Smooth outputs keep 0.9 and more of it, measured drives behind a rectifier 0.46 to 0.78.
+/// The same, as a share of the curvature that remains once the output is unfolded. Below this share it turns sharply at its lowest
+/// and nowhere else. Smooth outputs keep 0.9 and more, measured drives behind a rectifier 0.46 to 0.78.
 const UNFOLDED: f64 = 0.8;
 
 /// Fewest turns that say so.
@@ -15,8 +15,8 @@ const TURNS: usize = 10;
 /// How near its lowest an output turns that is folded there, in parts of its range.
 const NEAR: f64 = 0.12;
 
-/// `alike` is the part of the motion that goes with the command as the model says, `without_sign` that which goes with the size of the
-/// model's output.
+/// `alike` is the part of the motion that follows the command as the model says, `without_sign` the part that follows the size of
+/// the model's output.
 pub(crate) fn unlike(records: &[Prepared], alike: f64, without_sign: f64) -> String {
     let part = format!(
         "only {:.0} % of the motion goes with the command as the model says, at any gain and delay",
@@ -46,8 +46,8 @@ pub(crate) fn unlike(records: &[Prepared], alike: f64, without_sign: f64) -> Str
     )
 }
 
-/// The part of the curvature (energy of second differences) that is left where the outputs change their sign at every turn near
-/// their lowest that becomes straighter so, and the number of such turns.
+/// The share of the curvature (energy of second differences) that remains if the outputs change their sign at every turn near
+/// their lowest that becomes straighter by it, and the number of such turns.
 fn unfolded(records: &[Prepared]) -> (f64, usize) {
     let (mut before, mut after, mut turns) = (0.0, 0.0, 0);
     for r in records.iter().filter(|r| !r.rest) {

@@ -40,22 +40,22 @@ pub struct Options {
     pub max_effects: usize,
     /// The command is an analogue signal sampled together with the output, not held between rows.
     pub interpolated_input: bool,
-    /// The base model is a constant gain fitted to these very records, those of a bare actuator and its displacement
-    /// sensor: the gain is free in every fit, the null included, and effects of the chip and of the bead are not looked for.
+    /// The base model is a constant gain fitted to these records, of a bare actuator and its displacement sensor. So the gain is
+    /// free in every fit, the null included, and effects of the chip and of the bead are not looked for.
     pub free_gain: bool,
     /// The plant need not have rested at its working point before a record: its transients are free in every record.
     pub free_start: bool,
-    /// The working point was taken from these very records: the ramp that an error of it makes of a bead's position is free in every
+    /// The working point was taken from these records. An error of it makes a ramp of a bead's position, which is free in every
     /// record, and no flow is named for it.
     pub free_working_point: bool,
     /// Work of simulations after which the search looks for no further effect, and says so; in units of [`WORK`].
     pub work: f64,
     /// The noise that the records are taken to have.
     pub noise: NoiseKind,
-    /// Units in which the records are, and in which results are told.
+    /// Units of the records, and of the results.
     pub units: Units,
-    /// Ids of effects of the user's own to look for beside the catalogue; others that a model file has defined are
-    /// simulated and not looked for.
+    /// Ids of the user's effects to look for next to the catalogue; others that a model file has defined are simulated and not
+    /// looked for.
     pub own_effects: Vec<&'static str>,
 }
 
@@ -76,10 +76,10 @@ impl Default for Options {
     }
 }
 
-/// Finds, names and adds what a model lacks.
+/// Finds and names the effects that a model lacks, and adds them.
 ///
-/// `progress` is told in words what goes on. The result depends on nothing but the model, the records and the options:
-/// neither on the order of the records nor on the number of threads, and a record cut in two is put together again.
+/// `progress` receives sentences on the work. The result depends only on the model, the records and the options. The order of the
+/// records and the number of threads change nothing, and a record cut in two is joined again.
 ///
 /// # Errors
 /// Records or a model about which no verdict is possible: see [`ReconcileError`].
@@ -151,7 +151,7 @@ fn within(
 
     let effort = Effort {
         threads: options.threads,
-        // Without a floor no set is a name: one effect is enough to say what the rest looks like.
+        // Without a floor no set gets a name: one effect is enough to say how the rest looks.
         max_effects: if floor.source.is_known() {
             options.max_effects
         } else {
@@ -168,7 +168,7 @@ fn within(
     ));
     explains_something(&mut found);
     take_back(&ctx, &mut found, effort);
-    // Without a floor, and beside a model of another rig, nothing small is a name.
+    // Without a floor, or next to a model of another rig, no small effect gets a name.
     let small = floor.source.is_known() && unlike.is_none();
     let (held, aside) = companions(&ctx, &mut found, effort, small, progress);
     found.fit.locking = (0..found.fit.parts.len())
@@ -187,8 +187,8 @@ fn within(
     Ok(assemble::assemble(&given, &ctx, found, held))
 }
 
-/// Takes out companions that stand for the form of the others and, where none does, adds (`small`) what is little beside them; with the
-/// held-out check of what stands in the end.
+/// Removes companions that only replace the form of the others. If there are none, adds (`small`) the small effects. Makes the
+/// held-out check of the final set.
 fn companions(
     ctx: &Context<'_>,
     found: &mut Found,
@@ -263,7 +263,7 @@ fn stated_noise(model: &Model, sample_s: f64) -> Option<NoiseModel> {
         .then(|| NoiseModel::new(noise.diffusion_um2_per_s, sample_s, noise.localisation_um))
 }
 
-/// Raw residuals without what an unknown state at the start makes.
+/// Raw residuals without the response to an unknown state at the start.
 fn free_of_start(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<f64>> {
     let (residual, _) = ctx.residual(fit);
     if !ctx.problem.base.free_start {
@@ -288,13 +288,13 @@ fn explains_something(found: &mut Found) {
     }
 }
 
-/// Takes back what is too small, and what stands at a bound.
+/// Removes effects that are too small or at a bound.
 fn take_back(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
     drop_small(ctx, found);
     drop_bound(ctx, found, effort);
 }
 
-/// Takes back what is smaller than anything that matters beside effects that explain the rest.
+/// Removes effects too small to matter if others explain the rest.
 fn drop_small(ctx: &Context<'_>, found: &mut Found) {
     let all = ctx.problem.all();
     let mut i = 0;
@@ -318,8 +318,8 @@ fn drop_small(ctx: &Context<'_>, found: &mut Found) {
     }
 }
 
-/// Takes back a part that stopped at a bound, where the set is whole without it: it took up what the equations of the others, that
-/// are not nature's to the last digit, leave over. Where the set is not, the part stays, and there is no name.
+/// Removes a part that stopped at a bound if the set is complete without it. Such a part took up the residual that the equations
+/// of the others leave, because they are not exactly nature's. If the set is not complete, the part stays, and there is no name.
 fn drop_bound(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
     let all = ctx.problem.all();
     while found.fit.parts.len() > 1
