@@ -305,52 +305,163 @@ impl std::fmt::Display for Proved {
     }
 }
 
+/// Lines of the sheet as a table, with their part where lines of several parts are in it.
+fn table<'a>(lines: impl Iterator<Item = &'a Line>, with_part: bool) -> Table {
+    let mut columns = vec![
+        Column::left("verdict"),
+        Column::left("what"),
+        Column::right("measured"),
+        Column::left("must be"),
+        Column::left("seen"),
+    ];
+    if with_part {
+        columns.insert(1, Column::left("part"));
+    }
+    let mut table = Table::with_columns(columns);
+    for line in lines {
+        let emphasis = match line.verdict {
+            Verdict::Passed => Emphasis::Good,
+            Verdict::Failed => Emphasis::Bad,
+            Verdict::NotTried => Emphasis::Plain,
+        };
+        let mut row = vec![
+            word(line.verdict).to_string(),
+            line.name.to_string(),
+            value(line),
+            line.limit.clone(),
+            line.note.clone(),
+        ];
+        if with_part {
+            row.insert(1, line.part.to_string());
+        }
+        table.row_with(emphasis, row);
+    }
+    table
+}
+
 impl Proved {
+    fn failures(&self) -> impl Iterator<Item = &Line> {
+        let lines = self.sheet.lines.iter();
+        lines.filter(|line| line.verdict == Verdict::Failed)
+    }
+
+    /// What came out, in a sentence that names each failed line.
+    fn sentence(&self) -> String {
+        let tried = self.passed + self.failed;
+        let left = match self.not_tried {
+            0 => String::new(),
+            1 => " One line was not tried.".to_owned(),
+            n => format!(" {n} lines were not tried."),
+        };
+        if tried == 0 {
+            return format!("Nothing was tried.{left}");
+        }
+        let names: Vec<String> = self
+            .failures()
+            .map(|line| format!("{} ({})", line.name, line.part))
+            .collect();
+        if names.is_empty() {
+            format!("{tried} of {tried} lines that were tried passed.{left}")
+        } else {
+            format!(
+                "{} of {tried} lines failed: {}.{left}",
+                self.failed,
+                names.join(", ")
+            )
+        }
+    }
+
     fn page(&self) -> Report {
         let mut page = Report::new(&format!("Rig proved: {}", self.rig.display()));
-        let status = if self.failed == 0 {
-            Emphasis::Good
-        } else {
-            Emphasis::Bad
-        };
-        page.note(
-            status,
-            &format!(
-                "{} lines passed, {} failed, {} were not tried",
-                self.passed, self.failed, self.not_tried
-            ),
-        );
-        page.paragraph(&format!("{}, cellpos {}", self.at, self.program));
         let mut parts: Vec<&str> = self.sheet.lines.iter().map(|line| line.part).collect();
         parts.dedup();
+        let mut named = parts.clone();
+        named.sort_unstable();
+        named.dedup();
+        page.lead(&format!(
+            "Task: test whether the rig {} does what a run relies on. Parts: {}. {}, cellpos {}.",
+            self.rig.display(),
+            named.join(", "),
+            self.at,
+            self.program
+        ));
+        let status = match (self.failed, self.passed) {
+            (0, 0) => Emphasis::Plain,
+            (0, _) => Emphasis::Good,
+            _ => Emphasis::Bad,
+        };
+        page.result(status, &self.sentence());
+        page.certainty(
+            "each line was tried once, now, on this machine. Lines about time fail on a busy machine; a fault that comes once an hour passes.",
+        );
+        if self.failed > 0 {
+            page.section("What failed");
+            page.table(table(self.failures(), true));
+        }
         for part in parts {
             page.section(part);
-            let mut table = Table::new([
-                Column::left("verdict"),
-                Column::left("what"),
-                Column::right("measured"),
-                Column::left("must be"),
-                Column::left("seen"),
-            ]);
-            for line in self.sheet.lines.iter().filter(|line| line.part == part) {
-                let emphasis = match line.verdict {
-                    Verdict::Passed => Emphasis::Good,
-                    Verdict::Failed => Emphasis::Bad,
-                    Verdict::NotTried => Emphasis::Plain,
-                };
-                table.row_with(
-                    emphasis,
-                    [
-                        word(line.verdict).to_string(),
-                        line.name.to_string(),
-                        value(line),
-                        line.limit.clone(),
-                        line.note.clone(),
-                    ],
-                );
-            }
-            page.table(table);
+            let lines = self.sheet.lines.iter();
+            page.table(table(lines.filter(|line| line.part == part), false));
         }
         page
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn proved(sheet: Sheet) -> Proved {
+        let [passed, failed, not_tried] = sheet.counts();
+        Proved {
+            rig: "rig.toml".into(),
+            at: "2026-11-20 08:00:00 UTC".to_owned(),
+            program: "0.0.0",
+            passed,
+            failed,
+            not_tried,
+            sheet,
+        }
+    }
+
+    #[test]
+    fn the_page_says_first_what_was_tried_what_came_out_and_what_failed() {
+        let mut sheet = Sheet::default();
+        sheet.judge(
+            ("board", "answers hello"),
+            true,
+            (0.1, "ms"),
+            "an answer",
+            "",
+        );
+        let good = proved(sheet.clone());
+        assert_eq!(good.sentence(), "1 of 1 lines that were tried passed.");
+        sheet.judge(
+            ("camera", "frames lost"),
+            false,
+            (12.0, ""),
+            "none",
+            "12 of 900",
+        );
+        sheet.leave(("board", "reset in mid-flight"), "--reset asks for it");
+        let bad = proved(sheet);
+        assert_eq!(
+            bad.sentence(),
+            "1 of 2 lines failed: frames lost (camera). One line was not tried."
+        );
+        let html = bad.page().to_html();
+        let at = |text: &str| html.find(text).unwrap_or_else(|| panic!("no {text}"));
+        let order = [
+            "Task: test",
+            "1 of 2 lines failed",
+            "each line was tried once",
+            "12 of 900",
+            "answers hello",
+        ];
+        assert!(
+            order.windows(2).all(|pair| at(pair[0]) < at(pair[1])),
+            "{html}"
+        );
+        assert_eq!(proved(Sheet::default()).sentence(), "Nothing was tried.");
     }
 }

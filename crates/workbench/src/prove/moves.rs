@@ -207,7 +207,10 @@ fn follows(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<(), Failure
         state == Some(BoardState::Running) && ms < 10.0,
         (ms, "ms"),
         "status with its number, state running, within 10 ms",
-        format!("{state:?}"),
+        state.map_or_else(
+            || "no status".to_owned(),
+            |state| format!("{state:?}").to_lowercase(),
+        ),
     );
     range.settle(t, range.base_pm)?;
     let from = t.seq;

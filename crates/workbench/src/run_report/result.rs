@@ -279,9 +279,15 @@ fn of_waves(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said
             some[some.len() - 1]
         ),
     };
+    let of_waves = |row: &&CycleRow| row.commanded_um.is_finite();
+    let but = disturbed(
+        (rows.iter())
+            .filter(super::fatigue::is_whole)
+            .filter(of_waves),
+    );
     Some(Said {
         result: format!(
-            "{shares} (means of {cycles} cycles). Error: {error} nm RMS{}.",
+            "{shares} (means of {cycles} cycles{but}). Error: {error} nm RMS{}.",
             possible(bound)
         ),
         sure: sure_of_cycles(bound),
@@ -404,6 +410,23 @@ mod tests {
             "{text}"
         );
         assert!(of_a_cell(&[]).is_none());
+    }
+
+    #[test]
+    fn a_bead_whose_cycles_were_disturbed_says_so_beside_their_number() {
+        let rows: Vec<CycleRow> = (0..8)
+            .map(|cycle| {
+                let mut row = CycleRow::empty(cycle, 1, ArmKind::Cyclic);
+                (row.stroke_um, row.duration_s, row.rms_um) = (3.0, 0.5, 0.05);
+                (row.commanded_um, row.reached_um) = (3.0, 3.0);
+                if cycle < 3 {
+                    row.flags = CycleFlags(CycleFlags::DISTURBED);
+                }
+                row
+            })
+            .collect();
+        let text = of_waves(&rows, None, "bead").unwrap().result;
+        assert!(text.contains("8 cycles, 3 of them disturbed"), "{text}");
     }
 
     #[test]
