@@ -422,14 +422,16 @@ fn free_run_noise(result: &Reconciliation) -> String {
         let end_s = figure(shown as f64 * result.sample_s);
         let away = small(result, walk);
         left.push(format!(
-            "a Brownian path, some {away} from its start after {end_s} s"
+            "a Brownian path, which goes some {away} in {end_s} s"
         ));
     }
-    if result.traces.ramp {
-        left.push("a ramp, because the plant integrates the error of the zero flow".to_owned());
-    }
+    let off = if result.traces.ramp {
+        "a level and a ramp, which an error of the zero flow makes"
+    } else {
+        "a level"
+    };
     format!(
-        "Free runs of both models from the start of each record. A right model still leaves {}.",
+        "Free runs of both models from the start of each record, less {off}, as in the gap. A right model still leaves {}.",
         left.join(", and ")
     )
 }

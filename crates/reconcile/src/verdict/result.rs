@@ -3,6 +3,7 @@
 use crate::data::floor::FloorSource;
 use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
+use crate::problem::Prepared;
 use crate::verdict::battery::Hypothesis;
 use crate::verdict::map::DiscrepancyMap;
 use cellpos_plant::Model;
@@ -195,11 +196,11 @@ pub struct Trace {
     pub time_s: Vec<f64>,
     /// Measured position, NaN where missing \[um\].
     pub measured_um: Vec<f64>,
-    /// Null model, carried along with the measured position by its own filter \[um\].
+    /// Free run of the null model, without the motions that every fit leaves free: level, start, ramp \[um\].
     pub before_um: Vec<f64>,
     /// The same for the augmented model \[um\].
     pub after_um: Vec<f64>,
-    /// Free-run residual of the null model \[um\].
+    /// Measured less this free run \[um\].
     pub residual_before_um: Vec<f64>,
     /// Free-run residual of the augmented model \[um\].
     pub residual_after_um: Vec<f64>,
@@ -210,47 +211,40 @@ pub struct Trace {
 pub struct Traces {
     /// Record by record.
     pub all: Vec<Trace>,
-    /// Whether a command that is off by a constant becomes a ramp: the plant integrates.
+    /// Whether a constant error of the command becomes a ramp, which is taken off: the plant integrates.
     pub ramp: bool,
 }
 
 impl Traces {
     pub(crate) fn new(ctx: &Context<'_>, null: &Fit, fit: &Fit) -> Self {
         let sample_s = ctx.problem.base.sample_s;
-        let (before, sim_before) = ctx.residual(null);
-        let (after, sim_after) = ctx.residual(fit);
+        let ramp = ctx.integrates();
+        let (before, _) = ctx.residual(null);
+        let (after, _) = ctx.residual(fit);
+        let trace = |(i, r): (usize, &Prepared)| {
+            let n = r.u.len().min((4.0 / sample_s) as usize);
+            let seen = |of: &dyn Fn(usize) -> f64| -> Vec<f64> {
+                (0..n)
+                    .map(|k| if r.present[k] { of(k) } else { f64::NAN })
+                    .collect()
+            };
+            let (left_before, left_after) = (
+                r.without_start(&before[i], ramp),
+                r.without_start(&after[i], ramp),
+            );
+            Trace {
+                record: r.name.clone(),
+                time_s: (0..n).map(|k| k as f64 * sample_s).collect(),
+                measured_um: seen(&|k| r.y[k]),
+                before_um: seen(&|k| r.y[k] - left_before[k]),
+                after_um: seen(&|k| r.y[k] - left_after[k]),
+                residual_before_um: seen(&|k| left_before[k]),
+                residual_after_um: seen(&|k| left_after[k]),
+            }
+        };
         Self {
-            ramp: ctx.integrates(),
-            all: ctx
-                .problem
-                .records
-                .iter()
-                .enumerate()
-                .map(|(i, r)| {
-                    let n = r.u.len().min((4.0 / sample_s) as usize);
-                    let measured: Vec<f64> = (0..n)
-                        .map(|k| if r.present[k] { r.y[k] } else { f64::NAN })
-                        .collect();
-                    let start = |s: &[Vec<f64>]| {
-                        (0..n)
-                            .find(|&k| r.present[k])
-                            .map_or(0.0, |k| r.y[k] - s[i][k])
-                    };
-                    let (b0, a0) = (start(&sim_before), start(&sim_after));
-                    Trace {
-                        record: r.name.clone(),
-                        time_s: (0..n).map(|k| k as f64 * sample_s).collect(),
-                        measured_um: measured,
-                        before_um: sim_before[i][..n].iter().map(|s| s + b0).collect(),
-                        after_um: sim_after[i][..n].iter().map(|s| s + a0).collect(),
-                        residual_before_um: before[i][..n]
-                            .iter()
-                            .map(|e| e - before[i][0])
-                            .collect(),
-                        residual_after_um: after[i][..n].iter().map(|e| e - after[i][0]).collect(),
-                    }
-                })
-                .collect(),
+            ramp,
+            all: ctx.problem.records.iter().enumerate().map(trace).collect(),
         }
     }
 }

@@ -46,6 +46,26 @@ fn what_is_missing_is_named_beside_a_zero_flow_that_moves() {
     let p = &gain.parameters["factor"];
     let half = 0.5 * (p.ci95[1] - p.ci95[0]);
     assert!(half < 0.01 && (p.value - 0.8).abs() < 1.5 * half, "{p:?}");
+    the_traces_are_the_free_runs_of_the_gap(&r);
+}
+
+/// Level and ramp are free in the gap, and so in its picture.
+fn the_traces_are_the_free_runs_of_the_gap(r: &Reconciliation) {
+    for trace in &r.traces.all {
+        let pairs = [
+            (&trace.residual_before_um, r.gap.free_run_before),
+            (&trace.residual_after_um, r.gap.free_run_after),
+        ];
+        for (residual, gap) in pairs {
+            let seen: Vec<f64> = residual.iter().copied().filter(|e| e.is_finite()).collect();
+            let rms = (seen.iter().map(|e| e * e).sum::<f64>() / seen.len() as f64).sqrt();
+            assert!(
+                rms < 3.0 * gap,
+                "{}: {rms} um shown, {gap} in the gap",
+                trace.record
+            );
+        }
+    }
 }
 
 #[test]
