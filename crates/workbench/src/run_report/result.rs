@@ -279,12 +279,12 @@ fn of_waves(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said
             some[some.len() - 1]
         ),
     };
-    let of_waves = |row: &&CycleRow| row.commanded_um.is_finite();
-    let but = disturbed(
-        (rows.iter())
-            .filter(super::fatigue::is_whole)
-            .filter(of_waves),
-    );
+    let counted = |row: &&CycleRow| {
+        super::fatigue::is_whole(row)
+            && !super::cycles::was_elsewhere(row)
+            && (row.reached_um / row.commanded_um).is_finite()
+    };
+    let but = disturbed(rows.iter().filter(counted));
     Some(Said {
         result: format!(
             "{shares} (means of {cycles} cycles{but}). Error: {error} nm RMS{}.",
@@ -418,6 +418,7 @@ mod tests {
             .map(|cycle| {
                 let mut row = CycleRow::empty(cycle, 1, ArmKind::Cyclic);
                 (row.stroke_um, row.duration_s, row.rms_um) = (3.0, 0.5, 0.05);
+                (row.start_s, row.bias_um) = (cycle as f64, 0.0);
                 (row.commanded_um, row.reached_um) = (3.0, 3.0);
                 if cycle < 3 {
                     row.flags = CycleFlags(CycleFlags::DISTURBED);
