@@ -206,6 +206,19 @@ impl Sampler {
             + Complex::from_polar(early, -angle * self.row)
             + Complex::from_polar(late, -angle * (self.row + 1.0))
     }
+
+    /// Output rows for the rows of a held `input`, from rest at its first value on.
+    pub fn record(&self, input: &[f64]) -> Vec<f64> {
+        let mut output = self.smooth.record(input);
+        let (early, late) = self.late.unwrap_or((0.0, 0.0));
+        let row = self.row as usize;
+        for (share, row) in [(early, row), (late, row + 1)] {
+            for (to, value) in output.iter_mut().skip(row).zip(input) {
+                *to += share * (value - input[0]);
+            }
+        }
+        output
+    }
 }
 
 #[cfg(test)]

@@ -8,9 +8,11 @@ use nalgebra::Complex;
 use crate::error::IdentError;
 use crate::excitation::{ExcitationLimits, Signal, Tone, fold, shaped_amplitude_um};
 use crate::frequency_response::{
-    DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure,
+    DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure, scatter_of_rest,
 };
-use crate::noise::{NoiseModel, apply_noise_model, velocity_changes};
+use crate::noise::{NoiseModel, apply_noise_model};
+use crate::rest::{Rest, plant_of};
+use crate::sampled::Sampling;
 pub use crate::segments::{RecordedSegment, Schedule, Span, common_age_s};
 use cellpos_numeric::Random;
 use serde::{Deserialize, Serialize};
@@ -362,7 +364,30 @@ impl Plan {
         Ok(done)
     }
 
-    /// Measures the response at every driven line of the recorded segments, and weights the points by the noise model. Each point records
+    /// The driven stretch of a record, and the settings of its blocks; `None`: nothing was driven.
+    fn driven<'a>(
+        &'a self,
+        record: &'a RecordedSegment,
+        settings: &Settings,
+    ) -> Option<(DrivenStretch<'a>, Settings)> {
+        let planned = &self.segments[record.index];
+        let segment = DrivenStretch {
+            input: &record.input,
+            output: &record.output,
+            from: record.from,
+            to: record.input.len(),
+            period_s: self.period_s,
+            lines_hz: &planned.lines_hz,
+            detection_hz: &planned.detection_hz,
+        };
+        let settings = Settings {
+            block_s: planned.signal.repeats_s(),
+            ..*settings
+        };
+        (!planned.lines_hz.is_empty()).then_some((segment, settings))
+    }
+
+    /// Measures the response at every driven line of the recorded segments, weighted by the scatter of each line. Each point records
     /// how much older its frames were than [`common_age_s`]: a free-running camera clock drifts through the loop's grid in a minute, so
     /// the age differs between segments.
     ///
@@ -373,48 +398,69 @@ impl Plan {
         records: &[RecordedSegment],
         settings: &Settings,
     ) -> Result<Measured, IdentError> {
-        let mut points: Vec<FrequencyPoint> = Vec::new();
         let mut segments = Vec::new();
         let common_s = common_age_s(records);
         for record in records {
-            let planned = &self.segments[record.index];
-            if planned.lines_hz.is_empty() {
+            let Some((segment, settings)) = self.driven(record, settings) else {
                 continue;
-            }
-            let segment = DrivenStretch {
-                input: &record.input,
-                output: &record.output,
-                from: record.from,
-                to: record.input.len(),
-                period_s: self.period_s,
-                lines_hz: &planned.lines_hz,
-                detection_hz: &planned.detection_hz,
-            };
-            let settings = Settings {
-                block_s: planned.signal.repeats_s(),
-                ..*settings
             };
             let mut response = measure(&segment, &settings)?;
-            let velocity_changes = velocity_changes(&response.points, self.period_s);
-            for point in &mut response.points {
-                point.velocity_changes = velocity_changes;
-            }
             if let (Some(age_s), Some(common_s)) = (record.age_s, common_s) {
                 for point in &mut response.points {
                     point.later_s = age_s - common_s;
                 }
             }
-            points.extend(response.points.iter().cloned());
             segments.push(response);
         }
-        let noise = apply_noise_model(&mut points, self.period_s);
-        points.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
         Ok(Measured {
-            points,
-            noise,
+            points: by_frequency(&segments),
+            noise: None,
             segments,
         })
     }
+
+    /// The same, with the noise of the record: what is left of it when a plant that fits the lines has taken off its response to the
+    /// command. It weights the points, if it describes the scatter of the lines. `two_lags`: as for [`crate::summary::summarise`].
+    ///
+    /// # Errors
+    /// Those of [`measure`].
+    pub fn analyse_with_noise(
+        &self,
+        records: &[RecordedSegment],
+        settings: &Settings,
+        sampling: Sampling,
+        two_lags: bool,
+    ) -> Result<Measured, IdentError> {
+        let mut measured = self.analyse(records, settings)?;
+        let Ok(model) = plant_of(&measured.points, sampling, two_lags) else {
+            // Too few lines for a plant: each is weighted by its own scatter.
+            return Ok(measured);
+        };
+        let lines_hz = measured.points.iter().map(|p| p.frequency_hz);
+        let lowest_hz = lines_hz.fold(f64::INFINITY, f64::min);
+        let mut octaves = Vec::new();
+        let driven = records.iter().filter_map(|r| self.driven(r, settings));
+        for ((segment, settings), response) in driven.zip(&mut measured.segments) {
+            let later_s = response.points.first().map_or(0.0, |p| p.later_s);
+            let rest = Rest::of(&segment, &model, later_s, sampling);
+            scatter_of_rest(&mut response.points, &segment, &settings, &rest.rows);
+            for point in &mut response.points {
+                point.velocity_changes = rest.velocity_changes;
+            }
+            octaves.extend(rest.octaves(&segment, lowest_hz));
+        }
+        measured.points = by_frequency(&measured.segments);
+        measured.noise = apply_noise_model(&octaves, &mut measured.points, self.period_s);
+        Ok(measured)
+    }
+}
+
+/// The points of all segments in order of frequency.
+fn by_frequency(segments: &[SegmentResponse]) -> Vec<FrequencyPoint> {
+    let points = segments.iter().flat_map(|s| s.points.iter().cloned());
+    let mut points: Vec<FrequencyPoint> = points.collect();
+    points.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
+    points
 }
 
 /// Second and third harmonic of a line after folding, unless they fall on the line, zero or half the rate.

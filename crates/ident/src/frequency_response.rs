@@ -95,6 +95,8 @@ pub struct FrequencyPoint {
     pub later_s: f64,
     /// Mean square of the change of the output's velocity from row to row in the segment of this point, (output unit/s)^2.
     pub velocity_changes: f64,
+    /// Variance of `response`, `E|error|^2`, for white increments of the output of variance 1 (levels, if they were fitted); 0: not known.
+    pub spread: f64,
 }
 
 impl FrequencyPoint {
@@ -107,6 +109,7 @@ impl FrequencyPoint {
             scatter_variance: self.scatter_variance * power,
             variance: self.variance * power,
             block_errors: self.block_errors.iter().map(|e| e * factor).collect(),
+            spread: self.spread * power,
             ..self.clone()
         }
     }
@@ -182,7 +185,7 @@ pub fn measure(
         .copied()
         .collect();
     let lowest = all.iter().copied().fold(f64::INFINITY, f64::min);
-    let columns = 2 * all.len() + settings.fit.drift_degree + 1;
+    let columns = columns(&all, settings);
     let to = segment.to.min(segment.input.len());
     let rows = to.saturating_sub(segment.from);
     if rows < 2 * (columns + 4) || rows as f64 * segment.period_s * lowest < 2.0 {
@@ -193,16 +196,7 @@ pub fn measure(
             needed: periods.max(2 * (columns + 4)),
         });
     }
-    // Blocks long enough for the regressors, so that a multisine is cut into fewer blocks.
-    let most = settings.most_blocks.min(rows / (2 * columns)).max(2);
-    let borders = block_borders(
-        segment.from,
-        to,
-        segment.period_s,
-        settings.block_s.map_or(lowest, |block_s| 1.0 / block_s),
-        settings.min_periods,
-        most,
-    );
+    let borders = borders(segment, settings, &all);
     let mut inputs: Vec<Vec<Complex<f64>>> = Vec::new();
     let mut outputs: Vec<Vec<Complex<f64>>> = Vec::new();
     let (mut used, mut residual) = (0, 0.0);
@@ -264,6 +258,59 @@ pub fn measure(
     })
 }
 
+fn columns(all_hz: &[f64], settings: &Settings) -> usize {
+    2 * all_hz.len() + settings.fit.drift_degree + 1
+}
+
+/// Borders of the blocks of a segment whose lines are `all_hz`.
+fn borders(segment: &DrivenStretch<'_>, settings: &Settings, all_hz: &[f64]) -> Vec<usize> {
+    let lowest = all_hz.iter().copied().fold(f64::INFINITY, f64::min);
+    let to = segment.to.min(segment.input.len());
+    let rows = to.saturating_sub(segment.from);
+    // Blocks long enough for the regressors, so that a multisine is cut into fewer blocks.
+    let most = (settings.most_blocks).min(rows / (2 * columns(all_hz, settings)));
+    block_borders(
+        segment.from,
+        to,
+        segment.period_s,
+        settings.block_s.map_or(lowest, |block_s| 1.0 / block_s),
+        settings.min_periods,
+        most.max(2),
+    )
+}
+
+/// Replaces the scatter of `points`, the driven lines of `segment`, by that of `rest`: its output less the response of a plant to its
+/// input. What a block's input began before the block, and what it leaves to the next, is then no scatter.
+pub(crate) fn scatter_of_rest(
+    points: &mut [FrequencyPoint],
+    segment: &DrivenStretch<'_>,
+    settings: &Settings,
+    rest: &[f64],
+) {
+    let all: Vec<f64> = [segment.lines_hz, segment.detection_hz].concat();
+    let of_block = |w: &[usize]| {
+        let block = fit_block(rest, w[0], w[1], segment.period_s, &all, settings.fit)?;
+        (2 * block.rows > w[1] - w[0]).then_some(block)
+    };
+    let borders = borders(segment, settings, &all);
+    let blocks: Vec<_> = borders.windows(2).filter_map(of_block).collect();
+    let count = blocks.len() as f64;
+    if count < 2.0 {
+        return;
+    }
+    for (i, point) in points.iter_mut().enumerate() {
+        let own: Vec<Complex<f64>> = blocks.iter().map(|block| block.phasors[i]).collect();
+        let common = mean(&own);
+        point.block_errors = own.iter().map(|e| (e - common) / point.input).collect();
+        let sum: f64 = point.block_errors.iter().map(|e| e.norm_sqr()).sum();
+        point.scatter_variance = sum / (count * (count - 1.0));
+        point.variance = point.scatter_variance;
+        point.variance_dof = 2.0 * (count - 1.0);
+        let spread: f64 = blocks.iter().map(|block| block.spread[i]).sum();
+        point.spread = spread / (count * count * point.input.norm_sqr());
+    }
+}
+
 fn mean(values: &[Complex<f64>]) -> Complex<f64> {
     values.iter().sum::<Complex<f64>>() / values.len() as f64
 }
@@ -316,6 +363,7 @@ fn point(
         rows,
         later_s: 0.0,
         velocity_changes: 0.0,
+        spread: 0.0,
     })
 }
 

@@ -256,6 +256,7 @@ fn weighed(p: &Measured, form: Form) -> FrequencyPoint {
         rows: 0,
         later_s: 0.0,
         velocity_changes: 0.0,
+        spread: 0.0,
     }
 }
 

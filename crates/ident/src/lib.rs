@@ -47,6 +47,7 @@ pub mod least_squares;
 pub mod noise;
 pub mod order_selection;
 pub mod rational;
+mod rest;
 pub mod sampled;
 mod segments;
 pub mod spectral;

@@ -33,26 +33,37 @@ pub struct NoiseModel {
 }
 
 /// Power of increments at `frequency_hz`: `|1 - e^(-j 2 pi f T)|^2`.
-fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
+pub(crate) fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
     let angle = 2.0 * std::f64::consts::PI * frequency_hz * period_s;
     (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr()
 }
 
-/// Mean square of the change of the bead's velocity from row to row that `points` of one segment show, (um/s)^2.
-pub(crate) fn velocity_changes(points: &[FrequencyPoint], period_s: f64) -> f64 {
-    let of = |p: &FrequencyPoint| {
-        let x = increment_power(p.frequency_hz, period_s);
-        0.5 * p.output.norm_sqr() * (x / period_s).powi(2)
-    };
-    points.iter().map(of).sum()
+/// Power of increments in a band, um^2 a row, as it was measured.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Scatter {
+    pub(crate) um2: f64,
+    /// Shares of Brownian motion, localisation noise and timing in it.
+    pub(crate) shares: [f64; 3],
+    pub(crate) dof: f64,
 }
 
-/// The scatter of increments at a line, um^2 a row, as it was measured.
-struct Scatter {
-    um2: f64,
-    /// Shares of Brownian motion, localisation noise and timing in it.
-    shares: [f64; 3],
-    dof: f64,
+impl Scatter {
+    pub(crate) const NONE: Self = Self {
+        um2: 0.0,
+        shares: [0.0; 3],
+        dof: 0.0,
+    };
+
+    /// The mean of both.
+    pub(crate) fn join(&mut self, other: &Self) {
+        let dof = self.dof + other.dof;
+        let of = other.dof / dof;
+        self.um2 += of * (other.um2 - self.um2);
+        for (share, other) in self.shares.iter_mut().zip(other.shares) {
+            *share += of * (other - *share);
+        }
+        self.dof = dof;
+    }
 }
 
 /// Levels of the three kinds of noise, none below 0, and what is known of them.
@@ -115,59 +126,90 @@ fn levels(data: &[Scatter], kinds: &[usize]) -> Option<Levels> {
             break;
         }
     }
-    if kinds.iter().any(|&kind| found.levels[kind] < 0.0) {
+    // An exposure of a whole period takes a sixth of Brownian motion off as if it were localisation noise.
+    let [walk, white, timing] = found.levels;
+    if walk < 0.0 || timing < 0.0 || white < -walk / 6.0 {
         return None;
     }
     found.information = 1.0 / information.try_inverse()?[(0, 0)];
-    found.deviance = data
-        .iter()
-        .map(|d| {
-            let r = d.um2 / sum(&found.levels, &d.shares);
-            d.dof * (r - 1.0 - r.ln())
-        })
-        .sum();
+    found.deviance = deviance(data, &found.levels);
     Some(found)
 }
 
-/// Fits the noise model to the scatter of `points`; if the model holds (p > 0.005), sets their `variance` from it.
-pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option<NoiseModel> {
-    let data: Vec<Scatter> = points
-        .iter()
-        .filter(|p| p.scatter_variance > 0.0 && p.variance_dof >= 2.0)
-        .map(|p| {
-            let x = increment_power(p.frequency_hz, period_s);
-            Scatter {
-                um2: p.scatter_variance * p.input.norm_sqr() * x * p.rows as f64 / 4.0,
-                shares: [1.0, x, p.velocity_changes],
-                dof: p.block_errors.len() as f64 * 2.0 - 2.0,
-            }
-        })
-        .collect();
-    let dof: f64 = data.iter().map(|d| d.dof).sum();
-    if data.len() < 3 || dof < 12.0 {
+fn deviance(data: &[Scatter], levels: &[f64; 3]) -> f64 {
+    let of = |d: &Scatter| {
+        let r = d.um2 / sum(levels, &d.shares);
+        d.dof * (r - 1.0 - r.ln())
+    };
+    data.iter().map(of).sum()
+}
+
+/// Fits the levels of the noises to the power of increments between the lines, `octaves`; if they describe the scatter of the `points` (p >
+/// 0.005), sets their `variance` from them.
+pub(crate) fn apply_noise_model(
+    octaves: &[Scatter],
+    points: &mut [FrequencyPoint],
+    period_s: f64,
+) -> Option<NoiseModel> {
+    if octaves.len() < 4 {
         return None;
     }
-    // Lines of one segment saw one timing: the share of Brownian motion again.
-    let most = data.iter().map(|d| d.shares[2]).fold(0.0, f64::max);
-    let apart = data.iter().any(|d| d.shares[2] < 0.99 * most);
+    // Segments that saw one timing, or one segment: the share of Brownian motion again.
+    let most = octaves.iter().map(|d| d.shares[2]).fold(0.0, f64::max);
+    let apart = octaves.iter().any(|d| d.shares[2] < 0.99 * most);
     let kinds: &[&[usize]] = match apart {
         true => &[&[0], &[0, 1], &[0, 2], &[0, 1, 2]],
         false => &[&[0], &[0, 1]],
     };
     // The likeliest of those without a negative level is that of all levels from 0 on.
-    let found = kinds.iter().filter_map(|kinds| levels(&data, kinds));
+    let found = kinds.iter().filter_map(|kinds| levels(octaves, kinds));
     let found = found.min_by(|a, b| a.deviance.total_cmp(&b.deviance))?;
-    let free = found.levels.iter().filter(|&&level| level > 0.0).count();
-    let p_value = chi2_exceeds(
-        found.deviance,
-        (data.len() - free.min(data.len() - 1)) as f64,
-    );
+    let free = found.levels.iter().filter(|&&level| level != 0.0).count();
+    // What is uneven beyond chance is in the interval.
+    let widened = (found.deviance / (octaves.len() - free) as f64).max(1.0);
+    let dof = octaves.iter().map(|d| d.dof).sum::<f64>() / widened;
+    let level = |p: &FrequencyPoint| {
+        let x = increment_power(p.frequency_hz, period_s);
+        sum(&found.levels, &[1.0, x, p.velocity_changes]) * p.spread
+    };
+    let lines: Vec<Scatter> = points
+        .iter()
+        .filter(|p| p.scatter_variance > 0.0 && p.variance_dof >= 2.0)
+        .map(|p| Scatter {
+            um2: p.scatter_variance / level(p),
+            shares: [1.0, 0.0, 0.0],
+            dof: p.variance_dof,
+        })
+        .collect();
+    if std::env::var_os("DBG").is_some() {
+        for (p, l) in points.iter().zip(&lines) {
+            eprintln!(
+                "{} Hz {:.3} dof {} spread*rows*u2*x/4 {:.3}",
+                p.frequency_hz,
+                l.um2,
+                l.dof,
+                p.spread
+                    * p.rows as f64
+                    * p.input.norm_sqr()
+                    * increment_power(p.frequency_hz, period_s)
+                    / 4.0
+            );
+        }
+        for o in octaves {
+            eprintln!(
+                "octave x {:.3} dv2 {:.0} {:.3} dof {:.0}",
+                o.shares[1],
+                o.shares[2],
+                o.um2 / sum(&found.levels, &o.shares),
+                o.dof
+            );
+        }
+    }
+    let p_value = chi2_exceeds(deviance(&lines, &[1.0, 0.0, 0.0]), lines.len() as f64);
     let used = p_value > 0.005;
     if used {
         for p in points.iter_mut() {
-            let x = increment_power(p.frequency_hz, period_s);
-            let level = sum(&found.levels, &[1.0, x, p.velocity_changes]);
-            p.variance = 4.0 * level / (p.rows as f64 * x * p.input.norm_sqr());
+            p.variance = level(p);
             p.variance_dof = dof;
         }
     }
@@ -175,9 +217,9 @@ pub fn apply_noise_model(points: &mut [FrequencyPoint], period_s: f64) -> Option
     Some(NoiseModel {
         diffusion_um2_per_s: walk / (2.0 * period_s),
         diffusion_ci95_um2_per_s: student_t_quantile(0.975, dof)
-            / found.information.sqrt()
+            * (widened / found.information).sqrt()
             / (2.0 * period_s),
-        localisation_um: white.sqrt(),
+        localisation_um: white.max(0.0).sqrt(),
         timing_s: timing.sqrt(),
         dof,
         p_value,
@@ -191,37 +233,30 @@ mod tests {
 
     const PERIOD_S: f64 = 1e-3;
 
-    /// Lines whose scatter is that of 0.33 um^2/s, fixes of 10 nm and commands that come at times off by 0.2 ms.
-    fn lines(velocity_changes: impl Fn(usize) -> f64) -> Vec<FrequencyPoint> {
-        let point = |(i, frequency_hz): (usize, f64)| {
+    /// Octaves whose power is that of 0.33 um^2/s, fixes of 10 nm and commands that come at times off by 0.2 ms.
+    fn octaves(velocity_changes: impl Fn(usize) -> f64) -> Vec<Scatter> {
+        let of = |(i, frequency_hz): (usize, f64)| {
             let x = increment_power(frequency_hz, PERIOD_S);
             let level = 2.0 * 0.33 * PERIOD_S
                 + 0.01f64.powi(2) * x
                 + 0.2e-3f64.powi(2) * velocity_changes(i);
-            let none = Complex::new(0.0, 0.0);
-            FrequencyPoint {
-                frequency_hz,
-                response: none,
-                scatter_variance: 4.0 * level / (1000.0 * x),
-                variance: 1.0,
-                variance_dof: 14.0,
-                coherence: 1.0,
-                input: Complex::new(1.0, 0.0),
-                output: none,
-                block_errors: vec![none; 8],
-                rows: 1000,
-                later_s: 0.0,
-                velocity_changes: velocity_changes(i),
+            Scatter {
+                um2: level,
+                shares: [1.0, x, velocity_changes(i)],
+                dof: 1000.0,
             }
         };
         let hz = [2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0];
-        hz.into_iter().enumerate().map(point).collect()
+        hz.into_iter().enumerate().map(of).collect()
+    }
+
+    fn noise(octaves: &[Scatter]) -> NoiseModel {
+        apply_noise_model(octaves, &mut [], PERIOD_S).unwrap()
     }
 
     #[test]
     fn commands_at_uneven_times_are_no_diffusion_where_segments_differ() {
-        let mut apart = lines(|i| 3e3 * (i * i) as f64);
-        let noise = apply_noise_model(&mut apart, PERIOD_S).unwrap();
+        let noise = noise(&octaves(|i| 3e3 * (i * i) as f64));
         assert!((noise.diffusion_um2_per_s - 0.33).abs() < 1e-3, "{noise:?}");
         assert!(
             (noise.timing_s - 0.2e-3).abs() < 1e-6 && noise.used,
@@ -232,9 +267,19 @@ mod tests {
 
     #[test]
     fn lines_of_one_segment_leave_uneven_times_in_the_diffusion() {
-        let mut together = lines(|_| 1e4);
-        let noise = apply_noise_model(&mut together, PERIOD_S).unwrap();
+        let noise = noise(&octaves(|_| 1e4));
         assert!((noise.diffusion_um2_per_s - 0.53).abs() < 1e-3, "{noise:?}");
         assert!(noise.timing_s == 0.0, "{noise:?}");
+    }
+
+    #[test]
+    fn a_long_exposure_is_no_lack_of_diffusion() {
+        let mut averaged = octaves(|_| 0.0);
+        for octave in &mut averaged {
+            octave.um2 = 2.0 * 0.33 * PERIOD_S * (1.0 - 0.9 * octave.shares[1] / 6.0);
+        }
+        let noise = noise(&averaged);
+        assert!((noise.diffusion_um2_per_s - 0.33).abs() < 1e-3, "{noise:?}");
+        assert!(noise.localisation_um == 0.0, "{noise:?}");
     }
 }

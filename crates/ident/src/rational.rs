@@ -375,6 +375,7 @@ mod tests {
                     rows: 1000,
                     later_s: 0.0,
                     velocity_changes: 0.0,
+                    spread: 0.0,
                 }
             })
             .collect()

@@ -210,6 +210,29 @@ impl Sampled {
     }
 }
 
+impl Sampled {
+    /// Output rows for the rows of a held `input`, from rest at its first value on.
+    pub fn record(&self, input: &[f64]) -> Vec<f64> {
+        let first = input.first().copied().unwrap_or(0.0);
+        let mut output = vec![0.0; input.len()];
+        for part in &self.parts {
+            let at_once: f64 = (part.terms.iter())
+                .fold(self.plant.direct, |sum, t| sum + (t.residue * t.growth).re);
+            let mut states = vec![Complex::from(0.0); part.terms.len()];
+            for (to, value) in (part.rows as usize..output.len()).zip(input) {
+                let moved = value - first;
+                let mut sum = at_once * moved;
+                for (state, t) in states.iter_mut().zip(&part.terms) {
+                    sum += (t.residue * t.step * *state).re;
+                    *state = t.pole * *state + moved;
+                }
+                output[to] += part.share * sum;
+            }
+        }
+        output
+    }
+}
+
 /// Whole periods in a delay; a delay below a whole number by a rounding error counts as that number.
 fn whole_periods(periods: f64) -> f64 {
     (periods + 1e-9).floor()

@@ -292,6 +292,7 @@ pub fn by_reference(
             rows,
             later_s: 0.0,
             velocity_changes: 0.0,
+            spread: 0.0,
         })
     };
     lines.into_iter().filter_map(|(_, s)| point(s)).collect()

@@ -11,11 +11,11 @@ use crate::candidate_model::CandidateModel;
 use crate::delay::DelayEstimate;
 use crate::error::IdentError;
 use crate::experiment::Measured;
-use crate::frequency_response::FrequencyPoint;
 use crate::identifiability::{Judged, judge};
 use crate::order_selection::{
     CandidateFits, CandidateOrder, DelayPrior, OrderSelection, index, model_of,
 };
+use crate::rest::of_one_delay;
 use crate::sampled::Sampling;
 use cellpos_numeric::statistics::{Z95, f_exceeds};
 
@@ -139,38 +139,6 @@ pub fn summarise(
     };
     result.warnings = warnings(&result, stated_per_s);
     Ok(result)
-}
-
-/// Points whose frames were older or younger than on average, as frames of the average age would have shown them.
-///
-/// A longer delay is more than a phase shift: images of the held command that fold onto a line turn by another angle. A fit to the points
-/// with the phase shift alone describes the plant well enough for that part.
-fn of_one_delay(
-    points: Vec<FrequencyPoint>,
-    sampling: Sampling,
-    two_lags: bool,
-) -> Result<Vec<FrequencyPoint>, IdentError> {
-    if points.iter().all(|p| p.later_s == 0.0) {
-        return Ok(points);
-    }
-    let turned = points.iter().map(|p| {
-        let angle = std::f64::consts::TAU * p.frequency_hz * p.later_s;
-        p.scaled(Complex::from_polar(1.0, angle))
-    });
-    let turned: Vec<FrequencyPoint> = turned.collect();
-    let model = OrderSelection::new(&turned, sampling, None)?
-        .with_two_lags(two_lags)
-        .fit()?
-        .best()
-        .model;
-    let shown = |p: &FrequencyPoint, later_s: f64| {
-        let delay_s = model.delay_s + later_s;
-        CandidateModel { delay_s, ..model }.sampled_response(p.frequency_hz, sampling)
-    };
-    let all = points.iter();
-    Ok(all
-        .map(|p| p.scaled(shown(p, 0.0) / shown(p, p.later_s)))
-        .collect())
 }
 
 /// A phase moved by whole turns to within half a turn of `near`.

@@ -39,6 +39,11 @@ impl Default for ToneFit {
 pub struct BlockPhasors {
     /// One phasor per frequency, in the signal's unit (peak amplitude).
     pub phasors: Vec<Complex<f64>>,
+    /// Drift polynomial (of increments, if they are fitted), constant first, over -1 to 1 from the block's first row to its end.
+    pub drift: Vec<f64>,
+    /// Variance of each phasor, `E|error|^2`, for white rows (levels or increments) of variance 1. A block of few periods does not part a
+    /// sine from drift and from the other sines, so it is more than `4 / rows`.
+    pub spread: Vec<f64>,
     /// Residual variance per real row (levels or increments), unit^2.
     pub residual_variance: f64,
     /// Rows that took part.
@@ -127,6 +132,14 @@ pub fn fit_block(
     }
     let solved = factor.solve(&right);
     let explained = solved.dot(&right);
+    let inverse = factor.inverse();
+    let power = |angle: f64| match increments {
+        true => (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr(),
+        false => 1.0,
+    };
+    let spread = angles.iter().enumerate().map(|(i, &angle)| {
+        (inverse[(2 * i, 2 * i)] + inverse[(2 * i + 1, 2 * i + 1)]) / power(angle)
+    });
     let phasors = angles
         .iter()
         .enumerate()
@@ -141,6 +154,8 @@ pub fn fit_block(
         .collect();
     Some(BlockPhasors {
         phasors,
+        spread: spread.collect(),
+        drift: solved.iter().skip(2 * angles.len()).copied().collect(),
         residual_variance: ((sum_squares - explained) / (rows - columns) as f64).max(0.0),
         rows,
     })

@@ -31,7 +31,9 @@ fn plan() -> Plan {
 fn measured(rig: &mut PositionRig) -> Measured {
     let plan = plan();
     let records = plan.run(rig, 0, |_| {}).expect("the bead stays");
-    plan.analyse(&records, &Settings::default()).unwrap()
+    let sampling = Sampling::held(1.0 / PERIOD_S);
+    plan.analyse_with_noise(&records, &Settings::default(), sampling, false)
+        .unwrap()
 }
 
 fn fitted(m: &Measured, prior: Option<DelayPrior>, replicates: usize) -> (CandidateFits, Judged) {

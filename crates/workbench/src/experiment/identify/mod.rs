@@ -113,7 +113,12 @@ pub fn run_shown(
     // The delay is computed from the common age of the lines.
     let age_s = common_age_s(&records).unwrap_or(age_s);
     let measured = plan
-        .analyse(&records, &Settings::default())
+        .analyse_with_noise(
+            &records,
+            &Settings::default(),
+            job.setup.sampling(),
+            job.setup.two_lags,
+        )
         .map_err(Failure::failed)?;
     progress(total, total);
     // The LED test ends at the exposure, a row of the record at its tick.
