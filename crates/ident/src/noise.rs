@@ -1,12 +1,11 @@
-//! The noise of a bead's position record from the scatter at many lines: Brownian motion, localisation noise, and commands that come at
-//! uneven times.
+//! The noise of a bead's position record: Brownian motion, localisation noise, commands that come at uneven times, and a flow that wanders.
 //!
 //! Increments of a record hold `2 D T` of Brownian motion at every frequency and `s^2 |1 - e^(-jwT)|^2` of localisation
 //! noise. A command that comes `d` late moves the bead by `d` times the change of its velocity less, for good: with a standard deviation
-//! `t` of that time, increments hold `t^2` times the mean square of that change, which each segment knows of its own bead. Three numbers
-//! fitted to the scatter of all lines have far more degrees of freedom than the scatter of one line, so the weights are less noisy. If
-//! they do not describe the scatter (another rig, another disturbance), the scatter is used as measured. Not for finding the cause of
-//! such a disturbance.
+//! `t` of that time, increments hold `t^2` times the mean square of that change, which each segment knows of its own bead. A flow that
+//! wanders as a random walk puts its power over `|1 - e^(-jwT)|^2` into them. The levels are fitted to what the plant leaves of the record
+//! between the driven lines (`rest.rs`), so all rows tell of them. If they do not describe the scatter at the lines (another rig,
+//! another disturbance), the scatter is used as measured. Not for finding the cause of such a disturbance.
 
 use nalgebra::{Complex, DMatrix, DVector};
 
@@ -42,15 +41,15 @@ pub(crate) fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Scatter {
     pub(crate) um2: f64,
-    /// Shares of Brownian motion, localisation noise and timing in it.
-    pub(crate) shares: [f64; 3],
+    /// [`shares`] of the noises in it.
+    pub(crate) shares: [f64; 4],
     pub(crate) dof: f64,
 }
 
 impl Scatter {
     pub(crate) const NONE: Self = Self {
         um2: 0.0,
-        shares: [0.0; 3],
+        shares: [0.0; 4],
         dof: 0.0,
     };
 
@@ -66,16 +65,22 @@ impl Scatter {
     }
 }
 
-/// Levels of the three kinds of noise, none below 0, and what is known of them.
+/// Shares of Brownian motion, localisation noise, timing and a wandering flow in the power of increments at `frequency_hz`.
+pub(crate) fn shares(frequency_hz: f64, period_s: f64, velocity_changes: f64) -> [f64; 4] {
+    let x = increment_power(frequency_hz, period_s);
+    [1.0, x, velocity_changes, 1.0 / x]
+}
+
+/// Levels of the kinds of noise, none below 0, and what is known of them.
 struct Levels {
-    levels: [f64; 3],
+    levels: [f64; 4],
     /// Fisher's information on the first level, the others unknown.
     information: f64,
     deviance: f64,
 }
 
 /// Sum of the noises in a scatter, um^2 a row.
-fn sum(levels: &[f64; 3], shares: &[f64; 3]) -> f64 {
+fn sum(levels: &[f64; 4], shares: &[f64; 4]) -> f64 {
     levels.iter().zip(shares).map(|(l, s)| l * s).sum()
 }
 
@@ -86,7 +91,7 @@ fn levels(data: &[Scatter], kinds: &[usize]) -> Option<Levels> {
     let dof: f64 = data.iter().map(|d| d.dof).sum();
     let mean = data.iter().map(|d| d.um2 * d.dof).sum::<f64>() / dof;
     let mut found = Levels {
-        levels: [0.0; 3],
+        levels: [0.0; 4],
         information: 0.0,
         deviance: 0.0,
     };
@@ -127,8 +132,8 @@ fn levels(data: &[Scatter], kinds: &[usize]) -> Option<Levels> {
         }
     }
     // An exposure of a whole period takes a sixth of Brownian motion off as if it were localisation noise.
-    let [walk, white, timing] = found.levels;
-    if walk < 0.0 || timing < 0.0 || white < -walk / 6.0 {
+    let [walk, white, timing, wander] = found.levels;
+    if walk < 0.0 || timing < 0.0 || wander < 0.0 || white < -walk / 6.0 {
         return None;
     }
     found.information = 1.0 / information.try_inverse()?[(0, 0)];
@@ -136,7 +141,7 @@ fn levels(data: &[Scatter], kinds: &[usize]) -> Option<Levels> {
     Some(found)
 }
 
-fn deviance(data: &[Scatter], levels: &[f64; 3]) -> f64 {
+fn deviance(data: &[Scatter], levels: &[f64; 4]) -> f64 {
     let of = |d: &Scatter| {
         let r = d.um2 / sum(levels, &d.shares);
         d.dof * (r - 1.0 - r.ln())
@@ -157,55 +162,31 @@ pub(crate) fn apply_noise_model(
     // Segments that saw one timing, or one segment: the share of Brownian motion again.
     let most = octaves.iter().map(|d| d.shares[2]).fold(0.0, f64::max);
     let apart = octaves.iter().any(|d| d.shares[2] < 0.99 * most);
-    let kinds: &[&[usize]] = match apart {
-        true => &[&[0], &[0, 1], &[0, 2], &[0, 1, 2]],
-        false => &[&[0], &[0, 1]],
-    };
+    let kinds = (0..8_usize).filter(|set| apart || set & 2 == 0).map(|set| {
+        let others = (1..4).filter(move |kind| set >> (kind - 1) & 1 == 1);
+        std::iter::once(0).chain(others).collect::<Vec<usize>>()
+    });
     // The likeliest of those without a negative level is that of all levels from 0 on.
-    let found = kinds.iter().filter_map(|kinds| levels(octaves, kinds));
+    let found = kinds.filter_map(|kinds| levels(octaves, &kinds));
     let found = found.min_by(|a, b| a.deviance.total_cmp(&b.deviance))?;
     let free = found.levels.iter().filter(|&&level| level != 0.0).count();
     // What is uneven beyond chance is in the interval.
     let widened = (found.deviance / (octaves.len() - free) as f64).max(1.0);
     let dof = octaves.iter().map(|d| d.dof).sum::<f64>() / widened;
     let level = |p: &FrequencyPoint| {
-        let x = increment_power(p.frequency_hz, period_s);
-        sum(&found.levels, &[1.0, x, p.velocity_changes]) * p.spread
+        let shares = shares(p.frequency_hz, period_s, p.velocity_changes);
+        sum(&found.levels, &shares) * p.spread
     };
     let lines: Vec<Scatter> = points
         .iter()
         .filter(|p| p.scatter_variance > 0.0 && p.variance_dof >= 2.0)
         .map(|p| Scatter {
             um2: p.scatter_variance / level(p),
-            shares: [1.0, 0.0, 0.0],
+            shares: [1.0, 0.0, 0.0, 0.0],
             dof: p.variance_dof,
         })
         .collect();
-    if std::env::var_os("DBG").is_some() {
-        for (p, l) in points.iter().zip(&lines) {
-            eprintln!(
-                "{} Hz {:.3} dof {} spread*rows*u2*x/4 {:.3}",
-                p.frequency_hz,
-                l.um2,
-                l.dof,
-                p.spread
-                    * p.rows as f64
-                    * p.input.norm_sqr()
-                    * increment_power(p.frequency_hz, period_s)
-                    / 4.0
-            );
-        }
-        for o in octaves {
-            eprintln!(
-                "octave x {:.3} dv2 {:.0} {:.3} dof {:.0}",
-                o.shares[1],
-                o.shares[2],
-                o.um2 / sum(&found.levels, &o.shares),
-                o.dof
-            );
-        }
-    }
-    let p_value = chi2_exceeds(deviance(&lines, &[1.0, 0.0, 0.0]), lines.len() as f64);
+    let p_value = chi2_exceeds(deviance(&lines, &[1.0, 0.0, 0.0, 0.0]), lines.len() as f64);
     let used = p_value > 0.005;
     if used {
         for p in points.iter_mut() {
@@ -213,7 +194,7 @@ pub(crate) fn apply_noise_model(
             p.variance_dof = dof;
         }
     }
-    let [walk, white, timing] = found.levels;
+    let [walk, white, timing, _] = found.levels;
     Some(NoiseModel {
         diffusion_um2_per_s: walk / (2.0 * period_s),
         diffusion_ci95_um2_per_s: student_t_quantile(0.975, dof)
@@ -242,7 +223,7 @@ mod tests {
                 + 0.2e-3f64.powi(2) * velocity_changes(i);
             Scatter {
                 um2: level,
-                shares: [1.0, x, velocity_changes(i)],
+                shares: shares(frequency_hz, PERIOD_S, velocity_changes(i)),
                 dof: 1000.0,
             }
         };

@@ -10,7 +10,7 @@ use realfft::RealFftPlanner;
 use crate::candidate_model::CandidateModel;
 use crate::error::IdentError;
 use crate::frequency_response::{DrivenStretch, FrequencyPoint};
-use crate::noise::{Scatter, increment_power};
+use crate::noise::{Scatter, shares};
 use crate::order_selection::OrderSelection;
 use crate::sampled::Sampling;
 use crate::tone_fit::{ToneFit, fit_block};
@@ -150,10 +150,11 @@ impl Rest {
                 octaves.push((octave, Scatter::NONE));
             }
             // Localisation noise of a row without a neighbour cancels with nothing.
-            let x = 2.0 + (increment_power(hz, period_s) - 2.0) * pairs / shown;
+            let mut shares = shares(hz, period_s, self.velocity_changes);
+            shares[1] = 2.0 + (shares[1] - 2.0) * pairs / shown;
             let of_bin = Scatter {
                 um2: (value.re * value.re + value.im * value.im) / shown,
-                shares: [1.0, x, self.velocity_changes],
+                shares,
                 dof: 2.0 * shown / rows,
             };
             if let Some((_, sum)) = octaves.last_mut() {

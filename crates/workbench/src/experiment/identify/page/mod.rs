@@ -274,7 +274,7 @@ pub fn report(done: &Done, rig: &str, command_line: &str, eq6: bool) -> Report {
         .table(parameters(&result.judged.parameters));
     if let Some(noise) = result.measured.noise {
         report.paragraph(&format!(
-            "Noise from the scatter of all lines: diffusion {:.3} +- {:.3} um^2/s, localisation {:.1} nm RMS, times of the commands {:.3} ms RMS (p = {:.2}{}).",
+            "Noise, from what the fit leaves of the record between the lines: diffusion {:.3} +- {:.3} um^2/s, localisation {:.1} nm RMS, times of the commands {:.3} ms RMS (p = {:.2}{}).",
             noise.diffusion_um2_per_s,
             noise.diffusion_ci95_um2_per_s,
             noise.localisation_um * 1e3,
