@@ -68,7 +68,8 @@ impl Scatter {
 /// Shares of Brownian motion, localisation noise, timing and a wandering flow in the power of increments at `frequency_hz`.
 pub(crate) fn shares(frequency_hz: f64, period_s: f64, velocity_changes: f64) -> [f64; 4] {
     let x = increment_power(frequency_hz, period_s);
-    [1.0, x, velocity_changes, 1.0 / x]
+    // Positions at the ends of a row, whose velocity changes within it: a sixth less.
+    [1.0, x, velocity_changes, 1.0 / x - 1.0 / 6.0]
 }
 
 /// Levels of the kinds of noise, none below 0, and what is known of them.

@@ -122,16 +122,20 @@ impl Rest {
                 self.rows[k] - self.rows[k - 1] - (level(k) - level(k - 1)) - drift
             })
             .collect();
-        let shown = increments.iter().filter(|um| um.is_finite()).count() as f64;
-        let pairs = increments.windows(2);
-        let pairs = pairs
-            .filter(|pair| pair.iter().all(|um| um.is_finite()))
-            .count() as f64;
+        let weights: Vec<f64> = (increments.iter().enumerate())
+            .map(|(k, um)| match um.is_finite() {
+                true => taper(k, increments.len()),
+                false => 0.0,
+            })
+            .collect();
+        for (um, weight) in increments.iter_mut().zip(&weights) {
+            *um = if um.is_finite() { *um * weight } else { 0.0 };
+        }
+        let shown: f64 = weights.iter().map(|w| w * w).sum();
+        let pairs: f64 = weights.windows(2).map(|w| w[0] * w[1]).sum();
+        let fourth: f64 = weights.iter().map(|w| w.powi(4)).sum();
         let rows = increments.len() as f64;
         let plan = RealFftPlanner::<f64>::new().plan_fft_forward(increments.len());
-        for um in increments.iter_mut().filter(|um| !um.is_finite()) {
-            *um = 0.0;
-        }
         let mut spectrum = plan.make_output_vec();
         // Only wrong lengths are errors, and the plan made the buffers.
         if plan.process(&mut increments, &mut spectrum).is_err() {
@@ -139,9 +143,9 @@ impl Rest {
         }
         let bin_hz = 1.0 / (rows * period_s);
         let mut octaves: Vec<(usize, Scatter)> = Vec::new();
-        for (bin, value) in spectrum.iter().enumerate().skip(2) {
+        for (bin, value) in spectrum.iter().enumerate().skip(3) {
             let hz = bin as f64 * bin_hz;
-            let driven = |line: &f64| (hz - line).abs() < 1.5 * bin_hz;
+            let driven = |line: &f64| (hz - line).abs() < 2.5 * bin_hz;
             if hz < lowest_hz || 2.0 * (hz + bin_hz) * period_s > 1.0 || all.iter().any(driven) {
                 continue;
             }
@@ -155,7 +159,7 @@ impl Rest {
             let of_bin = Scatter {
                 um2: (value.re * value.re + value.im * value.im) / shown,
                 shares,
-                dof: 2.0 * shown / rows,
+                dof: 2.0 * shown * shown / (rows * fourth),
             };
             if let Some((_, sum)) = octaves.last_mut() {
                 sum.join(&of_bin);
@@ -163,4 +167,11 @@ impl Rest {
         }
         octaves.into_iter().map(|(_, scatter)| scatter).collect()
     }
+}
+
+/// A cosine over a tenth of the rows at each end: of a flow that wanders, ends that do not meet would show at every frequency.
+fn taper(row: usize, rows: usize) -> f64 {
+    let from_end = row.min(rows - 1 - row) as f64 + 0.5;
+    let part = (from_end / (0.1 * rows as f64)).min(1.0);
+    0.5 - 0.5 * (std::f64::consts::PI * part).cos()
 }

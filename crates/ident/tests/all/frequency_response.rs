@@ -237,9 +237,11 @@ fn a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
     );
     let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 21);
     let records = plan.run(&mut rig, 0, |_| {}).unwrap();
-    let measured = plan.analyse(&records, &Settings::default()).unwrap();
+    let sampling = Sampling::held(1.0 / PERIOD_S);
+    let settings = Settings::default();
+    let measured = plan.analyse_with_noise(&records, &settings, sampling, false);
+    let measured = measured.unwrap();
     let with = |stated_per_s| {
-        let sampling = Sampling::held(1.0 / PERIOD_S);
         summarise(measured.clone(), sampling, None, 0, 1, stated_per_s, false).unwrap()
     };
     let flags = |stated_per_s| {
