@@ -10,7 +10,7 @@ pub const MAX_WINDOW_PX: usize = 191;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum PixelNoise {
-    /// The same in every pixel, measured on the border of each window and averaged over the frames.
+    /// The same in every pixel of a window, measured on its border; where the windows of the last fixes agree, from all of them.
     #[default]
     Estimated,
     /// Known: variance `read_sd_grey^2 + shot_grey_per_electron * (grey - black_level_grey)`.

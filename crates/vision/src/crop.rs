@@ -11,6 +11,12 @@ pub(crate) const STRIDE: usize = MAX_WINDOW_PX.next_multiple_of(LANES);
 /// Most pixels of a window that are left out of a fit.
 const MOST_HOLES: usize = 32;
 
+/// Degrees of freedom of the noise variance for each difference of neighbours. Neighbouring differences have a pixel in common: the mean of
+/// their squares has the relative variance 2 * 1.5 / n.
+const FREEDOM: f64 = 0.67;
+/// Variance of rounding to whole numbers.
+const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
+
 /// One row of a window.
 pub(crate) type Row = [f32; STRIDE];
 
@@ -163,25 +169,51 @@ impl Crop {
         }
     }
 
-    /// Noise variance of a pixel from differences of neighbours along the border, grey levels squared. Differences are
-    /// blind to uneven light; those above four times the mean (another bead's edge) are left out.
-    pub(crate) fn noise_variance(&self) -> f64 {
-        let mut limit = f32::INFINITY;
+    /// Noise variance of a pixel from differences of neighbours along the border, grey levels squared, and its degrees of freedom.
+    /// Differences are blind to uneven light; those above four times the mean (another bead's edge) are left out, but none of one
+    /// step of the grey levels. The rounding to such steps is the least noise.
+    pub(crate) fn noise_variance(&self) -> (f64, f64) {
+        let step = self.grey_step();
+        let (mut limit, mut variance, mut used) = (f32::INFINITY, 0.0, 0.0);
         for _ in 0..2 {
-            let (mut previous, mut sum, mut count) = (0.0_f32, 0.0_f32, 0.0_f32);
+            let (mut previous, mut sum, mut squares, mut count) = (0.0, 0.0, 0.0, 0.0_f32);
             self.border(|v, neighbour| {
                 let d = (v - previous).abs();
                 previous = v;
                 if neighbour && d < limit {
                     sum += d;
+                    squares += d * d;
                     count += 1.0;
                 }
             });
-            limit = 4.0 * sum / count.max(1.0);
+            limit = (4.0 * sum / count.max(1.0)).max(1.5 * step);
+            (variance, used) = (0.5 * squares / count.max(1.0), count);
         }
-        // The mean of |d| for normal noise is sigma * 2 / sqrt(pi). `limit` holds four times it.
-        let sd = f64::from(limit) / 4.0 * core::f64::consts::PI.sqrt() / 2.0;
-        sd * sd
+        let rounding = ROUNDING_VARIANCE * f64::from(step * step);
+        (f64::from(variance).max(rounding), FREEDOM * f64::from(used))
+    }
+
+    /// Least difference of neighbours along the border and across the middle, 1 or more: the step of the grey levels where they have
+    /// fewer bits than their numbers.
+    fn grey_step(&self) -> f32 {
+        let mut step = f32::INFINITY;
+        let mut previous = 0.0_f32;
+        let mut look = |v: f32, neighbour: bool| {
+            let d = (v - previous).abs();
+            previous = v;
+            if neighbour && d > 0.5 && d < step {
+                step = d;
+            }
+        };
+        self.border(&mut look);
+        let middle = self.rows.get(self.height / 2).into_iter().flatten();
+        for (i, v) in middle.take(self.width).enumerate() {
+            look(*v, i > 0);
+        }
+        for (j, row) in self.rows.iter().take(self.height).enumerate() {
+            look(row[(self.width / 2).min(STRIDE - 1)], j > 0);
+        }
+        if step.is_finite() { step } else { 1.0 }
     }
 
     /// Centroid of the pixels on the bead's side of half the largest contrast, within `reach_px` of the brightest, in

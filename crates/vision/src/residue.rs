@@ -7,7 +7,7 @@
 use crate::config::MAX_WINDOW_PX;
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::Image;
-use crate::pool::Pool;
+use crate::pool::Scales;
 use crate::streak::Comb;
 use crate::template::Template;
 use nalgebra::{Matrix2, Vector2};
@@ -24,17 +24,17 @@ const INTERPOLATED: f64 = 0.83;
 const RINGS: usize = 2 * STRIDE;
 /// Most patches in a window.
 const MAX_PATCHES: usize = 256;
-/// Share of a new fix in the running widening, and in a bead's running look.
-const WIDENING_FORGETTING: f64 = 1.0 / 16.0;
+/// Share of a new fix in a bead's running look.
 const LOOK_FORGETTING: f64 = 1.0 / 64.0;
 /// A fix this near to a bead's last one is of that bead, bead radii: beads do not overlap.
 const SAME_RADII: f64 = 2.0;
 /// Beads remembered when nobody says how many there are: the followed one and its neighbours.
 const FEW_BEADS: usize = 12;
 
-/// Fixes of the bead itself that count as much as all others: a window's few patches tell a variance to half of it, beads of
-/// a recording differ by less.
-pub(crate) const POOLED_FIXES: f64 = 4.0;
+/// Degrees of freedom of a window's few patches: they tell a variance to half of it.
+const PATCHES_FREEDOM: f64 = 8.0;
+/// Least widening: of a window without noise.
+const LEAST_WIDENING: f64 = 1e-3;
 
 /// One vector a patch: what its pixels add to the score of the position, relative to the bead's contrast.
 type Scores = [[f32; 2]; MAX_PATCHES];
@@ -49,7 +49,6 @@ struct Look {
     /// Half the window that the scores are from: of another one they are not comparable.
     half: usize,
     mean: Scores,
-    widening: f64,
 }
 
 impl Look {
@@ -61,7 +60,6 @@ impl Look {
         fixes: 0,
         half: 0,
         mean: [[0.0; 2]; MAX_PATCHES],
-        widening: 0.0,
     };
 }
 
@@ -71,7 +69,7 @@ pub(crate) struct Residues {
     looks: Vec<Look>,
     fixes: u64,
     /// What first and later fixes of all beads were widened by.
-    pooled: [Pool; 2],
+    pooled: [Scales; 2],
     /// Room for what the template leaves of a window, and its mean at whole distances from the bead, px.
     pub left: Box<[Row; MAX_WINDOW_PX]>,
     rings: Box<[f32; RINGS]>,
@@ -82,7 +80,7 @@ impl Residues {
         Residues {
             looks: vec![Look::NONE; FEW_BEADS],
             fixes: 0,
-            pooled: [Pool::default(); 2],
+            pooled: [Scales::default(); 2],
             left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
             rings: Box::new([0.0; RINGS]),
         }
@@ -95,8 +93,8 @@ impl Residues {
     }
 
     /// By how much the variance of the position is larger than from noise of the even `variance` (grey^2), judged by what
-    /// the template leaves of this window and has left of the bead's windows before. `None` for a window with the bead far
-    /// off its middle. Allocates nothing.
+    /// the template leaves of this window, besides the bead's look, and has left of the windows before. `None` for a window
+    /// with the bead far off its middle. Allocates nothing.
     pub(crate) fn widening(
         &mut self,
         crop: &Crop,
@@ -124,20 +122,15 @@ impl Residues {
         let kept = INTERPOLATED + (1.0 - INTERPOLATED) * common;
         let now = widening_of(&scores, &look.mean, inverse, relative * own * kept)?;
         let pool = &mut self.pooled[usize::from(look.fixes > 0)];
-        // One window has few patches: the mean over the last fixes is surer. The first says nothing of what stays.
-        let share = (1.0 / known.max(1.0)).max(WIDENING_FORGETTING);
-        look.widening += share * (now - look.widening);
         for (mean, score) in look.mean.iter_mut().zip(&scores) {
             for (m, s) in mean.iter_mut().zip(score) {
                 *m += forgetting as f32 * (s - *m);
             }
         }
         look.fixes = look.fixes.saturating_add(1);
-        Some(pool.shrink(
-            look.widening,
-            known.clamp(1.0, 1.0 / WIDENING_FORGETTING),
-            POOLED_FIXES,
-        ))
+        let now = now.max(LEAST_WIDENING);
+        pool.take_in(now, PATCHES_FREEDOM);
+        Some(pool.moderate(now, PATCHES_FREEDOM))
     }
 
     /// The look of the bead at a place: the one of the nearest fix before, or a new one in place of that unused for longest.

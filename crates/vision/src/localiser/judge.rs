@@ -8,11 +8,12 @@ use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::left::Left;
 use crate::observed;
-use crate::residue::POOLED_FIXES;
 use crate::template::Template;
 
 /// Residual ratio from which the residual gives the variance. Noise alone does not reach it.
 pub(super) const WIDENED_RATIO: f64 = 1.3;
+/// Least residual ratio: of a window without noise.
+const LEAST_LEFT: f64 = 1e-3;
 /// Residual ratio of the pixels that tell the place, over the last fixes. A narrow bead has few of these pixels; noise alone varies by
 /// 0.06.
 const WIDENED_LOCALLY: f64 = 1.2;
@@ -23,6 +24,8 @@ const MEASURED: f64 = 0.135;
 const UNRESOLVED_PX: f64 = 2.5;
 /// Square of the least answer of a picture to a motion of the bead, over the template's: below, noise decides.
 const LEAST_ANSWER: f64 = 0.04;
+/// Fixes by which a look at one window is surer than the mean of the last: one window tells an answer with noise.
+const POOLED_FIXES: f64 = 4.0;
 /// Share of fixes that something spoils which spoils no others, before the window is looked at.
 const SPOILT: f64 = 0.01;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
@@ -162,11 +165,13 @@ impl Localiser {
     /// Narrows a fix's covariance if the last fixes have left less than the noise of the windows' borders. The end of a ring at the
     /// border counts as noise.
     fn narrow(&mut self, fix: &mut Fix) {
-        self.ratio.take_in(fix.residual_ratio);
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        self.ratio
+            .take_in(fix.residual_ratio.max(LEAST_LEFT), pixels);
         let (contrast, left) = self.explained(fix);
         self.unexplained.take_in(left / contrast);
         if let PixelNoise::Estimated = self.config.noise {
-            let factor = self.ratio.mean.clamp(0.5, 1.0);
+            let factor = self.ratio.common().unwrap_or(1.0).clamp(0.5, 1.0);
             fix.var_x_px2 *= factor;
             fix.var_y_px2 *= factor;
             fix.cov_xy_px2 *= factor;
@@ -184,14 +189,16 @@ impl Localiser {
             self.add_lines(fix, left);
         }
         let observed = self.observe(fix);
-        let more = fix.residual_ratio > WIDENED_RATIO || self.local.mean > WIDENED_LOCALLY;
+        let here = left.local_variance / self.pixel_variance(fix.background);
+        let (own, freedom) = self.by_pixels(here, 0.0);
+        let locally = self.local.moderate(own, freedom);
+        let more = fix.residual_ratio > WIDENED_RATIO || locally > WIDENED_LOCALLY;
         let (widening, answer) = if more {
             let (widening, of_rings) = self.widening_by_what_is_left(fix);
             let by_rings = self.template.radius_px() >= UNRESOLVED_PX || !self.comb.is_still();
             (widening, if by_rings { of_rings } else { observed })
         } else {
-            let left = left.local_variance / self.pixel_variance(fix.background);
-            (self.widening_by_pixels(left, 0.0), observed)
+            (self.widening_by_pixels(own, freedom), observed)
         };
         // One window tells it with noise; the last fixes have been in a like focus.
         let answer = if self.comb.is_still() || more {
@@ -235,15 +242,18 @@ impl Localiser {
         let at = (fix.x_px, fix.y_px);
         let background = fix.background - f64::from(self.crop.pedestal);
         let variance = self.pixel_variance(fix.background);
+        // In the noise that windows have in common: what is pooled would vary with that of each window.
+        let common = self.noises.common().unwrap_or(variance);
         let by_patches = self.residues.widening(
             &self.crop,
             &self.template,
             &self.comb,
             at,
             (fix.amplitude, background),
-            variance,
+            common,
         );
-        let by_patches = by_patches.unwrap_or(fix.residual_ratio).max(1.0);
+        let by_patches = by_patches.map_or(fix.residual_ratio, |w| w * common / variance);
+        let by_patches = by_patches.max(1.0);
         let (local, answer) = self.residues.besides_the_mean(
             &self.crop,
             &self.template,
@@ -253,27 +263,34 @@ impl Localiser {
         );
         // A ring's mean takes a part of its pixels: two thirds of one of 2 pi r, at half the radius.
         let by_rings = 2.0 / 3.0 * self.template.radius_px();
-        let by_pixels = self.widening_by_pixels(local / variance, by_rings);
+        let (own, freedom) = self.by_pixels(local / variance, by_rings);
+        let by_pixels = self.widening_by_pixels(own, freedom);
         (by_pixels.max(by_patches), answer)
     }
 
-    /// What the pixels that tell the place leave, over noise. Of a narrow bead they are few: their variance is that of the last
-    /// fixes, or this fix is spoilt, and it is their own. The posterior of the two weights them. Of a wide bead patches say more.
-    /// `taken` is what was fitted besides place and contrast, in pixels.
-    fn widening_by_pixels(&mut self, left: f64, taken: f64) -> f64 {
+    /// What the pixels that tell the place leave, over noise, and the degrees of freedom. `taken` is what was fitted besides place
+    /// and contrast, in pixels.
+    fn by_pixels(&self, left: f64, taken: f64) -> (f64, f64) {
         let radius_px = self.template.radius_px();
         // Of a Gaussian, exactly: the square of the sum of the squared derivatives, over the sum of their squares. Place and
         // contrast take their part.
         let pixels = (core::f64::consts::PI * radius_px * radius_px).max(8.0);
         let freedom = pixels - 3.0 - taken;
-        let own = left * pixels / freedom;
+        (left * pixels / freedom, freedom)
+    }
+
+    /// The variance by them. Of a narrow bead they are few: it is that of the last fixes, or this fix is spoilt, and it is their own.
+    /// The posterior of the two weights them. Of a wide bead patches say more.
+    fn widening_by_pixels(&mut self, own: f64, freedom: f64) -> f64 {
         if self.comb.is_still() {
-            self.local.take_in(own);
+            self.local.take_in(own.max(LEAST_LEFT), freedom);
         }
+        let radius_px = self.template.radius_px();
         if radius_px >= UNRESOLVED_PX {
             return 1.0;
         }
-        let ratio = (own / self.local.mean.max(1.0)).max(1.0);
+        let usual = self.local.common().unwrap_or(1.0).max(1.0);
+        let ratio = (own / usual).max(1.0);
         let odds = SPOILT * (0.5 * freedom * (ratio - 1.0 - ratio.ln())).exp();
         let spoilt = if odds.is_finite() {
             odds / (1.0 + odds)

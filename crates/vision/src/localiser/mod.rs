@@ -18,7 +18,7 @@ use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
 use crate::left::Left;
 use crate::observed;
-use crate::pool::Pool;
+use crate::pool::{Pool, Scales};
 use crate::residue::Residues;
 use crate::seed;
 use crate::speckle;
@@ -52,8 +52,11 @@ pub struct Localiser {
     template: Template,
     crop: Crop,
     sign: f64,
-    /// Running noise variance of a pixel, grey^2; `None` before the first frame.
+    /// Noise variance of a pixel in force, grey^2; `None` before the first frame.
     noise_variance: Option<f64>,
+    /// That of the window at hand with its degrees of freedom, and those of the last good fixes.
+    noise_here: (f64, f64),
+    noises: Scales,
     learner: Option<Learner>,
     /// Way of the bead during the exposure, expected and in use (px).
     streak: Way,
@@ -69,14 +72,14 @@ pub struct Localiser {
     /// How much of a window the bead fills: the whole window, and the narrow one.
     filled: [f64; 2],
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
-    local: Pool,
+    local: Scales,
     /// The same of the score of the place, which counts alike errors of neighbours; and what it is for white noise.
     scatter: Pool,
     white_scatter: f64,
     lines: [Pool; 2],
     /// What the last fixes were widened by, and their residual ratios.
     widened: Pool,
-    ratio: Pool,
+    ratio: Scales,
     /// Contrast of the last good fixes over the noise of a pixel.
     snr: Pool,
     /// Share of the beads' contrast in their windows that the last fixes left unexplained.
@@ -117,6 +120,8 @@ impl Localiser {
             crop: Crop::new(),
             sign,
             noise_variance: None,
+            noise_here: (1.0, 1.0),
+            noises: Scales::default(),
             learner,
             streak: Way::default(),
             comb: Comb::STILL,
@@ -125,12 +130,12 @@ impl Localiser {
             lopsided: 0.0,
             shading_px2,
             filled,
-            local: Pool::default(),
+            local: Scales::default(),
             scatter: Pool::default(),
             white_scatter,
             lines: [Pool::default(); 2],
             widened: Pool::default(),
-            ratio: Pool::default(),
+            ratio: Scales::default(),
             snr: Pool::default(),
             unexplained: Pool::default(),
             answers: Pool::default(),
@@ -275,12 +280,16 @@ impl Localiser {
         if !self.take_window(view, x_px, y_px, side_px) {
             return Fix::none(x_px, y_px, FixQuality::AtBorder);
         }
+        let mut fitted = self.fit(view, (x_px, y_px), side_px, MAX_RECENTRES);
         // The noise is read off the border of a whole window that holds one bead in its middle; anywhere else edges
         // would count as noise.
-        if self.noise_variance.is_none() {
-            self.update_noise();
+        let whole = side_px == self.config.window_px && self.comb.is_still();
+        if whole || self.noise_variance.is_none() {
+            self.read_noise();
+            if whole && !view.is_draft {
+                self.keep_noise();
+            }
         }
-        let mut fitted = self.fit(view, (x_px, y_px), side_px, MAX_RECENTRES);
         if !self.comb.is_still() {
             fitted = self.fit_length(view, fitted, side_px);
         }
@@ -310,13 +319,9 @@ impl Localiser {
             let variance = self.weight_unit() * widening * pass.amplitude_variance;
             fix.range_used = self.range_used(&fix, variance.sqrt());
         }
-        let whole = side_px == self.config.window_px && self.comb.is_still();
         if fix.verdict == FixQuality::Good && self.comb.is_still() {
             self.widened.take_in(widening);
             self.snr.take_in(fix.snr);
-        }
-        if fix.verdict == FixQuality::Good && whole {
-            self.update_noise();
         }
         fix
     }

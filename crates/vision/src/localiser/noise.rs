@@ -4,23 +4,28 @@ use super::Localiser;
 use crate::config::PixelNoise;
 use crate::fit::{Pass, Weights};
 
-/// Share of a new frame in the running noise estimate.
-const NOISE_FORGETTING: f64 = 1.0 / 64.0;
-/// Variance of rounding to whole grey levels, grey^2: the least that a pixel's noise can be.
-const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
+/// Degrees of freedom of the noise in the smallest window that a frame may hold, 5 x 5 px.
+const LEAST_FREEDOM: f64 = 8.0;
 
 impl Localiser {
-    pub(super) fn update_noise(&mut self) {
+    /// Puts the noise about the bead into force: that of its own window, as far as the windows of the last fixes differ.
+    pub(super) fn read_noise(&mut self) {
         self.noise_variance = Some(match self.config.noise {
             PixelNoise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
             PixelNoise::Estimated => {
-                let now = self.crop.noise_variance().max(ROUNDING_VARIANCE);
-                match self.noise_variance {
-                    Some(before) => before + NOISE_FORGETTING * (now - before),
-                    None => now,
-                }
+                let (variance, freedom) = self.crop.noise_variance();
+                self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
+                self.noises.moderate(self.noise_here.0, self.noise_here.1)
             }
         });
+    }
+
+    /// Takes in the noise of the window at hand, whatever the verdict: a noise that is thought too large would never be corrected by fixes
+    /// that it makes none.
+    pub(super) fn keep_noise(&mut self) {
+        if let PixelNoise::Estimated = self.config.noise {
+            self.noises.take_in(self.noise_here.0, self.noise_here.1);
+        }
     }
 
     /// Weights for the next pass, given what the pass before found: relative to [`Localiser::weight_unit`].

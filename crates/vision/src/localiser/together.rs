@@ -109,7 +109,7 @@ impl Localiser {
                 .crop
                 .take(frame, 0.5 * (x.0 + x.1), 0.5 * (y.0 + y.1), side_px);
         if taken && self.noise_variance.is_none() {
-            self.update_noise();
+            self.read_noise();
         }
         taken
     }
