@@ -104,14 +104,14 @@ impl LearnerState {
     }
 }
 
-/// Retreats after which the learning ends, if they follow one another within so many cycles.
+/// Retreats after which the learning ends, if they follow one another within this number of cycles.
 const MOST_RETREATS: u32 = 3;
 const FORGIVEN_CYCLES: f64 = 200.0;
 /// Errors below this are noise and no reason to retreat, um.
 const NOISE_UM: f64 = 0.1;
 /// Shortest time over which the guard looks, ticks.
 const GUARD_TICKS: f64 = 20.0;
-/// Stretches in a row that limits may spoil before what was learned is taken back.
+/// Stretches in a row that limits may spoil before the learned part is removed.
 const MOST_LIMITED: u32 = 2;
 /// Growth of the stretches.
 const LONGER: f64 = 1.5;
@@ -223,7 +223,7 @@ impl Learner {
         }
     }
 
-    /// Fixes of so many cycles; at least those that are watched.
+    /// Fixes of this number of cycles; at least those that are watched.
     fn fixes_of(&self, cycles: f64) -> u32 {
         let least = f64::from(self.config.watch_ticks) * self.fix_advance;
         (cycles.max(least.ceil()) / self.fix_advance)
@@ -334,8 +334,8 @@ impl Learner {
         (f64::from(state.since_change) / f64::from(self.ramp_ticks)).min(1.0)
     }
 
-    /// Learns from the error (bead less reference, um) at the phase (in cycles) at which the frame was exposed; `None`:
-    /// no fix that could be learned from in this tick. `driven` is what moves the bead now, at the phase `now`.
+    /// Learns from the error (bead less reference, um) at the phase (in cycles) at which the frame was exposed; `None`: this tick
+    /// has no fix to learn from. `driven` is the part that moves the bead now, at the phase `now`.
     pub fn learn(
         &self,
         state: &mut LearnerState,
@@ -379,7 +379,7 @@ impl Learner {
         }
     }
 
-    /// Begins a stretch of so many cycles.
+    /// Begins a stretch of this number of cycles.
     fn begin(&self, state: &mut LearnerState, cycles: f64) {
         state.evidence.begin_again();
         state.stretch = cycles.min(self.config.longest_cycles);
@@ -389,7 +389,7 @@ impl Learner {
     /// The end of a stretch: what stands out of the noise is corrected.
     fn look(&self, state: &mut LearnerState, driven: &Driven) {
         let evidence = state.evidence;
-        // Beyond range or slew the addition does not do what the response says, and what it does instead is not learned.
+        // Beyond range or slew the addition does not have its response, and its effect there is not learned.
         let learned = state.lines.iter().any(|line| line.active);
         state.limited = if evidence.is_limited() && learned {
             state.limited + 1
@@ -430,7 +430,7 @@ impl Learner {
             state.noise = noise;
             self.begin(state, state.stretch * LONGER);
         } else {
-            // Not yet enough to tell: the stretch goes on.
+            // Not enough data yet: the stretch continues.
             state.next_look = self.fixes_of(cycles * LONGER);
         }
     }
@@ -453,7 +453,7 @@ impl Learner {
         }
     }
 
-    /// Takes the addition back, and learns anew unless that has been in vain.
+    /// Removes the addition, and learns again unless that was in vain.
     fn retreat(&self, state: &mut LearnerState) {
         state.limited = 0;
         if state.cycles - state.retreat_cycle > FORGIVEN_CYCLES {

@@ -181,7 +181,7 @@ impl SimulatedRig {
             past.push_front(*position_um);
             past.truncate(self.whole + 1);
         } else if let Some((position_um, past)) = &mut self.held {
-            // The bead moves from the held position by what it would have moved in this tick.
+            // The bead moves from the held position by its motion in this tick.
             *position_um += free_um - before_um;
             past.push_front(*position_um);
             past.truncate(self.whole + 1);

@@ -1,5 +1,5 @@
-//! What a fit of place, contrast and level leaves out of a window: light that rises across it, and a bead out of focus, whose
-//! image is larger or smaller than the template.
+//! Parameters beyond place, contrast and level: light that rises across the window, and a bead out of focus, whose image is larger
+//! or smaller than the template.
 //!
 //! Light that rises draws the fit to its side. A template of another size weights the pixels wrongly, and between the pixels
 //! it is off its own centre. Both are nuisance parameters, and a window that does not need them would lose certainty by
@@ -14,7 +14,7 @@ use nalgebra::{SMatrix, SVector};
 /// Smallest and largest size that another focus or a blur makes of a bead. A blur of half the radius makes a Gaussian larger by the root
 /// of two. Farther off the rest of the picture has changed, too, and beads of other sizes are others.
 const SIZES: (f64, f64) = (0.8, 1.5);
-/// Share of what a fit leaves beyond noise that the parameters must explain: where something else is wrong they bend to it.
+/// Least share of a fit's excess residual that the parameters must explain: another error bends them to it.
 const LEAST_EXPLAINED: f64 = 0.3;
 /// Steps of the fit, and when it is at rest: place in px, size as a fraction.
 const MOST_STEPS: usize = 4;
@@ -35,8 +35,8 @@ pub(crate) struct Asked {
 }
 
 /// The fit of all parameters, from one of place, contrast and level on. Leaves the window without the slope and the template at
-/// the size found, and gives the slope; `None` where the window does not tell the parameters apart, or they explain too little: then both are as
-/// before. `start` is the place, and how much of the sum of squares is more than noise.
+/// the size found, and gives the slope. `None` if the window does not separate the parameters, or they explain too little: then
+/// both are as before. `start` is the place, and the excess of the sum of squares over noise.
 pub(crate) fn fit(
     crop: &mut Crop,
     template: &mut Template,

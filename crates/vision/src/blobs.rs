@@ -74,7 +74,7 @@ pub struct Blobs {
     found: Vec<Blob>,
     /// Contrast of the row at hand.
     row: Vec<f32>,
-    /// All runs of the frame, row by row, where they are wanted.
+    /// All runs of the frame, row by row, if they are wanted.
     runs: Vec<(u32, Run)>,
     dropped_runs: u64,
     max_runs: usize,

@@ -8,17 +8,17 @@ use crate::localiser::Localiser;
 use crate::seed::{LEAST_NOISE, PATCH, background, patch_sums};
 use crate::speckle;
 
-/// Share of the strongest contrast in the frame that a bead must reach to be seen beside it, in one look.
+/// Share of the strongest contrast in the frame that a bead must reach to be seen in the same look.
 const WEAKEST_SHARE: f32 = 0.3;
 /// Share of a bead's disc that must stand out.
 const LEAST_AREA_SHARE: f64 = 0.15;
-/// What a weaker look finds within so many radii of what a stronger one found is its ring.
+/// An object that a weaker look finds within this number of radii of a stronger one is its ring.
 const OWN_RADII: f64 = 1.5;
-/// Threshold for means of 3 x 3 pixels, as a share of that for one, and the radius of a bead from which they raise its
-/// contrast over the noise, px: 3 times the noise down, and a Gaussian of 0.75 px is 2.8 times lower in them.
+/// Threshold for means of 3 x 3 pixels, as a share of that for one, and the radius of a bead from which they raise its contrast
+/// over the noise, px. They lower the noise 3 times, and a Gaussian of 0.75 px 2.8 times.
 const SMOOTHED: f32 = 0.4;
 const SMOOTH_RADIUS_PX: f64 = 1.5;
-/// A region as small as this may be one hot pixel, or two next to each other, and what means of 3 x 3 pixels make of them.
+/// A region as small as this may be one hot pixel, or two next to each other, or their image in means of 3 x 3 pixels.
 const SPECK_AREA_PX: f64 = 12.0;
 /// Most beads that a detector is made for.
 const MOST_BEADS: usize = 20_000;
@@ -39,8 +39,8 @@ pub struct Detector {
 }
 
 impl Detector {
-    /// A detector for beads like the localiser's, with room for `max_beads` of them in a frame. One look at a frame: what is
-    /// much weaker than the strongest is not seen.
+    /// A detector for beads like the localiser's, with room for `max_beads` beads in a frame. One look at a frame: objects much
+    /// weaker than the strongest are not seen.
     pub fn new(localiser: &Localiser, max_beads: usize) -> Self {
         let max_beads = max_beads.clamp(1, MOST_BEADS);
         // A region shaped like a comb takes a label for each tooth.
@@ -58,7 +58,7 @@ impl Detector {
         }
     }
 
-    /// The same for recordings: a second look shows beads that are weak beside the strongest, or in the noise.
+    /// The same for recordings: a second look shows beads that are weak compared with the strongest, or hidden in the noise.
     pub fn thorough(localiser: &Localiser, max_beads: usize) -> Self {
         Detector {
             thorough: true,
@@ -124,7 +124,7 @@ impl Detector {
             self.keep_new(pixels, (width, height), least, 0);
         }
         if smooth {
-            // Beads as weak as the noise of a pixel: means of 3 x 3 pixels have a third of it.
+            // Beads as weak as the noise of a pixel: means of 3 x 3 pixels have a third of that noise.
             let (level, sums) = (&mut self.level, &mut self.sums);
             let inside = (width.saturating_sub(2), height.saturating_sub(2));
             let threshold = SMOOTHED * least;

@@ -25,7 +25,7 @@ pub(crate) enum Weights {
 }
 
 impl Weights {
-    /// Weights of a row where they are the same everywhere.
+    /// Weights of a row if they are the same everywhere.
     pub(crate) fn of_even(self, crop: &Crop) -> Row {
         let mut weight = crop.mask;
         if let Weights::Even { variance } = self {
@@ -147,7 +147,7 @@ impl Image {
         }
     }
 
-    /// The row `dy` px below the centre, which lies in the column `x`.
+    /// The row `dy` px below the centre, in the column `x`.
     #[inline(always)]
     pub(crate) fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
         let n = self.lanes_end;
@@ -265,8 +265,8 @@ impl Sums {
     }
 }
 
-/// Relative change of the template's radius that fits the window best at a fixed position, beside amplitude and
-/// background, and its standard deviation for an even noise `variance` (grey^2).
+/// Relative change of the template's radius that fits the window best at a fixed position, with free amplitude and background, and
+/// its standard deviation for an even noise `variance` (grey^2).
 pub(crate) fn scale(
     crop: &Crop,
     template: &Template,
@@ -299,8 +299,8 @@ pub(crate) fn scale(
     (change.is_finite() && sd.is_finite()).then_some((change, sd))
 }
 
-/// Change of the comb's length, as a fraction of it, that fits the window best at fixed positions and relative contrasts of the
-/// beads (x and y in px, contrast), all in the same flow, beside a common contrast and background: one secant step.
+/// Change of the comb's length, as a fraction of it, that fits the window best: one secant step. Positions and relative contrasts
+/// of the beads are fixed (x and y in px, contrast), all in the same flow. A common contrast and background are free.
 pub(crate) fn stretch(
     crop: &Crop,
     template: &Template,

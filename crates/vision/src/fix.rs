@@ -33,12 +33,12 @@ pub struct Fix {
     pub amplitude: f64,
     /// Fitted background, grey levels.
     pub background: f64,
-    /// Residual sum of squares over what the noise predicts (chi^2 per degree of freedom): about 1 for a true bead.
+    /// Residual sum of squares over the noise's prediction (chi^2 per degree of freedom): about 1 for a true bead.
     pub residual_ratio: f64,
     /// Peak contrast over the noise of one pixel.
     pub snr: f64,
-    /// How much of the range that the settings hold for is used up: near 0 for a bead like those they were made for, 1 where a bead
-    /// is no longer a good fix. The larger of the shares that noise and shape use. Measured for good fixes.
+    /// Used share of the settings' range: near 0 for a bead like those of the settings, 1 if a bead is no longer a good fix. The
+    /// larger of the shares that noise and shape use. Measured for good fixes.
     pub range_used: f64,
     /// Whether the fix can be used.
     pub verdict: FixQuality,

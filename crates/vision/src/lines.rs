@@ -1,4 +1,4 @@
-//! How much of a bead's contrast the rows and columns of the picture explain: those that a camera reads out with an offset of
+//! The part of a bead's contrast that rows and columns of the picture explain: those that a camera reads out with an offset of
 //! their own, a scratch, the wall of a channel.
 
 use crate::crop::{Crop, LANES, STRIDE};
@@ -6,9 +6,9 @@ use crate::fit::Image;
 use crate::streak::Comb;
 use crate::template::Template;
 
-/// Pixels beside the bead from which a line's offset is told, bead radii from its centre.
+/// Pixels next to the bead that show a line's offset, bead radii from its centre.
 const BESIDE_RADII: f32 = 0.8;
-/// Fewest of them.
+/// Least number of these pixels.
 const FEWEST: f32 = 4.0;
 
 /// Contrast that the offsets of the lines through a bead would give it, and its variance for pixels of variance 1.
@@ -18,7 +18,7 @@ pub(crate) struct Explained {
     pub variance: f64,
 }
 
-/// Sums along one line: light beside the bead and its pixels; the bead's own.
+/// Sums along one line: light next to the bead and its pixels; the bead's own.
 #[derive(Clone, Copy, Default)]
 struct Line {
     beside: f32,
@@ -47,7 +47,7 @@ pub(crate) fn explained(
         image.draw_row(template, comb, x, j as f32 - y);
         let across = pixels.iter().zip(&image.value).zip(&mut columns);
         for (i, ((p, f), column)) in across.enumerate().take(crop.width) {
-            // The bead's own light is off: what is left beside it is the line's.
+            // The bead's own light is removed: the rest is the line's.
             let light = p - background as f32 - amplitude as f32 * f;
             row.share += f;
             column.share += f;

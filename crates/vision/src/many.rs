@@ -17,7 +17,7 @@ const MOST_REMEMBERED: usize = 2000;
 pub struct LinkConfig {
     /// Farthest that a bead moves between frames, px.
     pub max_step_px: f64,
-    /// Frames that a bead may be missed before its number is given up.
+    /// Frames without a bead after which its number is given up.
     pub memory_frames: u32,
     /// Most beads in a frame.
     pub max_beads: usize,
@@ -79,7 +79,7 @@ impl ManyTracker {
         &self.sights
     }
 
-    /// What stood out in the last frame and got no number: fits that are not good, and of no bead known.
+    /// Objects of the last frame without a number: fits that are not good, and of no known bead.
     pub fn refused(&self) -> &[Fix] {
         &self.refused
     }

@@ -130,7 +130,7 @@ impl Flat {
         flat
     }
 
-    /// Takes off a parabola fitted to what is not an object.
+    /// Subtracts a parabola fitted to the pixels outside the object.
     pub(crate) fn flatten(&mut self) {
         use nalgebra::{SMatrix, SVector};
         let (width, height) = (self.width.max(1) as f64, self.height.max(1) as f64);

@@ -1,23 +1,23 @@
-//! The sandwich covariance of a place (Huber 1967): how much the picture answers to a motion of the bead, and how much what the fit
-//! leaves scatters the score of the place.
+//! The sandwich covariance of a place (Huber 1967): the picture's answer to a motion of the bead, and the scatter of the place's
+//! score by the residual of the fit.
 //!
-//! The sum of squares S has the second derivative A^2 g.g - A r.f'' by the place (A contrast, f template, g its derivative, r what is
-//! left). The first part is what the template expects. Of a blurred bead, whose edges the template has steeper, the whole is less, and
-//! the place is told worse in proportion. The score, the sum of g r over the pixels, scatters by more than white noise says where
-//! the errors of neighbouring pixels are alike, as a codec makes them. Its variance is the sum over pairs of pixels with Bartlett's
-//! weights in both directions (Newey and West 1987), which is that over all squares of [`SIDE`] pixels.
+//! The sum of squares S has the second derivative A^2 g.g - A r.f'' by the place (A contrast, f template, g its derivative, r
+//! residual). The first part is the template's expectation. A blurred bead has flatter edges than the template, so the whole is
+//! smaller, and the place is less sure in proportion. The score is the sum of g r over the pixels. It scatters by more than for
+//! white noise if the errors of neighbouring pixels are alike, as a codec makes them. Its variance is the sum over pairs of pixels
+//! with Bartlett's weights in both directions (Newey and West 1987), which is the sum over all squares of [`SIDE`] pixels.
 
 use crate::crop::{Crop, Row, STRIDE};
 use crate::fit::Image;
 use crate::streak::Comb;
 use crate::template::Template;
 
-/// Side of the squares whose errors count as one, px. In pictures of a codec the stated error of Gaussians of 1 to 4 px is 0.9 to 1.15 of
-/// the true one with 3, 0.58 to 1.07 with 1, no better with 4 (right template). Noise that is alike over two pixels and as wide as the bead
-/// is mostly fitted as place and contrast: of its excess a fifth is found.
+/// Side of the squares whose errors count as one, px. In pictures of a codec the stated error of Gaussians of 1 to 4 px is 0.9 to
+/// 1.15 of the true one with 3, 0.58 to 1.07 with 1, no better with 4 (right template). Noise that is alike over two pixels and as
+/// wide as the bead is mostly fitted as place and contrast: a fifth of its excess is found.
 const SIDE: usize = 3;
 
-/// What a window says about the covariance of the place, beside noise and template.
+/// A window's contribution to the covariance of the place, in addition to noise and template.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Observed {
     /// Observed over expected information about the place, mean of the two directions: 1 for a picture of the template. Noise

@@ -1,9 +1,10 @@
-//! Offsets that the rows and columns of a window have, as a camera reads them out: their variance from fix to fix, and what they move.
+//! Offsets of the rows and columns of a window, as a camera reads them out: their variance from fix to fix, and their effect on
+//! the position.
 
-/// Offsets that rows, or columns, have of their own.
+/// Offsets of separate rows or columns.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Lines {
-    /// Variance between the means of neighbouring lines beside the bead, grey^2 ...
+    /// Variance between the means of neighbouring lines next to the bead, grey^2 ...
     between: f64,
     /// ... and what noise of variance 1 grey^2 contributes to it.
     of_noise: f64,
@@ -17,7 +18,7 @@ impl Lines {
         self.between - variance * self.of_noise
     }
 
-    /// From the sums of each line beside the bead and their pixels, and the sums of the template's derivative along it.
+    /// From the sums of each line next to the bead and their pixels, and the sums of the template's derivative along it.
     pub(crate) fn of(
         sums: &[f32],
         pixels: &[f32],

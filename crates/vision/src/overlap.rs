@@ -1,17 +1,16 @@
 //! The radial profile of beads whose images overlap: all beads of a frame explain each pixel together.
 //!
-//! The picture is linear in the profile, so one profile that all beads share is found in one step, wherever their images overlap. As
-//! in [`crate::smooth`] it is a parametric profile and a smooth deviation that the halves of the beads confirm in each other. Each
-//! bead's surroundings have a level of their own; the deviation ends where the profile is looked at no farther, so that no level is
-//! part of it.
+//! The picture is linear in the profile, so one profile that all beads share is found in one step, wherever their images overlap.
+//! As in [`crate::smooth`] it is a parametric profile and a smooth deviation that the halves of the beads confirm in each other.
+//! Each bead's surroundings have a separate level; the deviation ends with the profile, so that no level is part of it.
 
 use crate::fix::squared;
 use crate::objects::{Bead, Flat};
 use crate::smooth::{BINS, LEAST_GAIN, Learnt, PENALTIES, Parametric, basis, knots, mirrored};
 use nalgebra::{DMatrix, DVector};
 
-/// Sums of products, over the pixels of a half of the beads, of what explains them: the coefficients of the deviation, the parametric
-/// profile, and last the grey value.
+/// Sums of products over the pixels of a half of the beads: the coefficients of the deviation, the parametric profile, and last
+/// the grey value.
 struct Sums {
     products: DMatrix<f64>,
     pixels: f64,
@@ -49,7 +48,7 @@ impl Sums {
     /// Coefficients for a penalty on the second differences.
     fn solve(&self, contrast: f64, penalty: f64) -> Option<DVector<f64>> {
         let mut normal = self.normal();
-        // The last coefficient, at the end, is 0 and is none of these.
+        // The last coefficient, at the end, is 0 and not among these.
         let knots = normal.nrows() + 1;
         for row in 0..knots {
             let near = |k: isize| mirrored(row as isize + k, knots);

@@ -28,8 +28,8 @@ pub trait RadialProfile {
     /// Radius beyond which the profile is zero, px.
     fn support_px(&self) -> f64;
 
-    /// Value averaged over the area of a pixel whose centre is at `r_px`: `f + (f'' + f'/r) / 24`, the first term of
-    /// the average's expansion; what is left out is of fourth order in the pixel over the bead's finest detail.
+    /// Value averaged over the area of a pixel whose centre is at `r_px`: `f + (f'' + f'/r) / 24`, the first term of the average's
+    /// expansion. The rest is of fourth order in the pixel over the bead's finest detail.
     fn pixel_value(&self, r_px: f64) -> f64 {
         const STEP_PX: f64 = 1e-2;
         let r_px = r_px.abs();
@@ -161,8 +161,8 @@ pub(crate) fn clamped_curvatures(values: &[f64], upper: &mut [f64], curvatures: 
 
 /// Bright core with a dark ring, as a bead shows in bright field slightly out of focus: the measured profile, scaled.
 ///
-/// For an edge radius of 6.37 px, as measured, the ring's minimum (-0.54) lies at 8.5 px and the faint outer lobe
-/// (+0.03) at 12.1 px.
+/// For an edge radius of 6.37 px, as measured, the ring's minimum (-0.54) is at 8.5 px and the faint outer lobe (+0.03) at 12.1
+/// px.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RingProfile(SplineProfile);
 

@@ -1,12 +1,12 @@
-//! The range that settings hold for, found by trying: beads as the template has them are drawn larger, smaller, blurred and in more
-//! noise, until the localiser no longer finds nine in ten.
+//! The range of settings, found by trying: beads of the template are drawn larger, smaller, blurred and in more noise, until the
+//! localiser no longer finds nine in ten.
 
 use crate::config::LocaliserConfig;
 use crate::fix::FixQuality;
 use crate::frame::{Frame, Pixels};
 use crate::localiser::Localiser;
 
-/// Beads of a trial, and how many of them have to be found.
+/// Beads of a trial, and the least number to be found.
 const BEADS: usize = 20;
 const FOUND: usize = 18;
 /// Contrast and background of the beads drawn, grey levels.
@@ -18,7 +18,7 @@ const SIZE: (f64, f64) = (0.05, 0.5);
 const BLUR: (f64, f64) = (0.1, 2.0);
 const NOISE: (f64, f64) = (1.25, 20.0);
 
-/// What settings hold for: nine in ten beads are a good fix, each alone changed so far.
+/// The range of settings: nine in ten beads are a good fix, each changed alone.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
     /// Smallest and largest image of the bead, as another focus makes it, relative to the template.

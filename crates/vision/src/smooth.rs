@@ -17,8 +17,8 @@ const MOST_KNOTS: usize = 32;
 const LEAST_KNOT_PX: f64 = 0.7;
 /// Penalties tried: a factor of two from one to the next. The largest leaves a constant.
 pub(crate) const PENALTIES: i32 = 40;
-/// Least gain in predicting the other half, in variances of the noise: with a true parametric profile the best of all
-/// penalties gains so much less often than once in 100 draws (`chance_confirms_no_deviation`).
+/// Least gain in predicting the other half, in variances of the noise. With a true parametric profile the best of all penalties
+/// gains so much less often than once in 100 draws (`chance_confirms_no_deviation`).
 pub(crate) const LEAST_GAIN: f64 = 10.0;
 
 /// Grey values by their distance from the centre, with weights, in the two halves of the beads.
@@ -194,7 +194,7 @@ impl Rings {
         let left_by_prior = other[0].left + other[1].left;
         let mut best = (f64::INFINITY, 0.0);
         for n in 0..PENALTIES {
-            // Relative to the weight that a knot has: from next to nothing of it to far more.
+            // Relative to the weight of a knot: from a tiny part of it to a multiple.
             let penalty = own[0].scale.max(own[1].scale) * 2.0_f64.powi(n - 20);
             let left = own.iter().zip(&other).map(|(own, other)| {
                 let deviation = own.solve(penalty)?;

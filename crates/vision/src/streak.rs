@@ -4,8 +4,8 @@
 //! command that takes effect meanwhile changes the speed: the slower half of the way is the brighter one. The position is the mean of the
 //! way; at constant velocity that is its middle.
 
-/// Ways shorter than this are no streak, in bead radii: the second-order blur of such a way (0.0033 squared radii of
-/// variance) is below what a template is ever known to.
+/// Ways shorter than this are no streak, in bead radii: the second-order blur of such a way (0.0033 squared radii of variance) is
+/// below the uncertainty of any template.
 const LEAST_RADII: f64 = 0.2;
 /// Distance of the teeth, in bead radii.
 const TOOTH_RADII: f64 = 0.2;
@@ -18,7 +18,7 @@ pub(crate) struct Comb {
     teeth: usize,
     step_x_px: f32,
     step_y_px: f32,
-    /// Half of what the second half of the way is longer than the first, a tooth.
+    /// Half of the difference between the second half of the way and the first, per tooth.
     turn_x_px: f32,
     turn_y_px: f32,
 }
@@ -28,7 +28,7 @@ pub(crate) struct Comb {
 pub(crate) struct Way {
     /// From the start to the end.
     pub whole_px: (f64, f64),
-    /// What the second half is longer than the first.
+    /// Length of the second half less the first.
     pub turn_px: (f64, f64),
 }
 
@@ -124,7 +124,7 @@ mod tests {
         let offsets: Vec<_> = comb.offsets().collect();
         assert_eq!(offsets.len(), 10);
         let (x, y) = offsets[9];
-        // Ten teeth of a way of 10 px stand in the middles of its ten parts.
+        // Ten teeth of a way of 10 px are in the middles of its ten parts.
         assert!((f32::hypot(x, y) - 4.5).abs() < 1e-5, "{x} {y}");
         assert!((offsets[0].0 + x).abs() < 1e-6 && (offsets[0].1 + y).abs() < 1e-6);
     }

@@ -1,8 +1,9 @@
-//! Settings found from a recording: strong objects that come again, their mean radial profile, and what they are told by.
+//! Settings found from a recording: strong objects that come again, their mean radial profile, and their distinguishing
+//! properties.
 //!
-//! For a recording whose beads nobody has described. Objects of either polarity are looked for by their contrast against a
-//! smooth background, those of the commonest size and contrast are taken as beads, and the mean profile about their centres
-//! becomes the template: aligned, fitted, aligned again. Offline; allocates.
+//! For a recording whose beads nobody has described. Objects of either polarity are found by their contrast against a smooth
+//! background, and those of the commonest size and contrast are taken as beads. The mean profile about their centres becomes the
+//! template: aligned, fitted, aligned again. Offline; allocates.
 
 use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
 use crate::fix::{Fix, FixQuality};
@@ -32,18 +33,18 @@ const KINDS: usize = 3;
 /// Margin on the residual that the beads themselves have: that of nine in ten, since dust and neighbours spoil some.
 const TOLERANCE_MARGIN: f64 = 2.0;
 const TOLERANCE_SHARE: f64 = 0.9;
-/// Contrast over the noise that a bead may fall to, as a share of what the recording has: five times the noise, with a margin for
-/// beads that are fainter than most.
+/// Least contrast over the noise of a bead, as a share of the recording's: five times the noise, with a margin for beads that are
+/// fainter than most.
 const ROOM_FOR_NOISE: f64 = 0.13;
-/// Largest tolerance: at 0.26 the template explains half of what a bead adds to its window (mean square 0.135 of the contrast's:
+/// Largest tolerance. At 0.26 the template explains half of a bead's part of its window (mean square 0.135 of the contrast's:
 /// [`crate::Localiser`]), and most beads must be explained by half of that.
 const MOST_TOLERANCE: f64 = 0.26;
 
 /// What was found in a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Suggestion {
-    /// Settings of the localiser. Their profile is a table where a learnt one predicts beads not seen better than the best
-    /// Gaussian or ring, and that Gaussian or ring where it does not.
+    /// Settings of the localiser. Their profile is a table if a learnt one predicts unseen beads better than the best Gaussian or
+    /// ring; otherwise it is that Gaussian or ring.
     pub config: LocaliserConfig,
     /// Farthest that a bead went from frame to frame, with a margin, px.
     pub max_step_px: f64,
@@ -55,7 +56,7 @@ pub struct Suggestion {
     pub refused: Refused,
     /// Median of the beads' peak contrast over the noise.
     pub snr: f64,
-    /// What the settings hold for, tried with beads drawn from their template; `None` where they do not find these.
+    /// The range of the settings, tried with beads drawn from their template; `None` if they do not find these.
     pub range: Option<Range>,
 }
 
@@ -132,8 +133,8 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
     }))
 }
 
-/// The template learnt from the beads that a detector with rough settings sees, whatever their fits say: a size that is
-/// wrong by a fifth or so is put right.
+/// The template learnt from the beads that a detector with rough settings sees, whatever their fits say. That corrects a size that
+/// is wrong by a fifth or so.
 ///
 /// # Errors
 /// As [`suggest`].
@@ -293,8 +294,8 @@ fn commonest(objects: &[Object]) -> Vec<Object> {
     best.map(alike).unwrap_or_default()
 }
 
-/// Grey values over the distance from the objects' centres, up to `reach_px`: of each object its own contrast and level taken
-/// off by the template of the pass before.
+/// Grey values over the distance from the objects' centres, up to `reach_px`: of each object with its contrast and level removed
+/// by the template of the previous pass.
 fn collect(
     flats: &[Flat],
     beads: &[Bead],
@@ -405,7 +406,7 @@ fn core_knots(values: &[f64; TABLE_KNOTS]) -> f64 {
     })
 }
 
-/// Farthest step of a bead between frames next to each other, with a margin; a bead's reach where there are none.
+/// Farthest step of a bead between neighbouring frames, with a margin; without such steps, a bead's reach.
 fn step_px(fits: &[(usize, crate::Fix)], reach_px: f64) -> f64 {
     let mut steps = Vec::new();
     for (n, fix) in fits {

@@ -122,8 +122,8 @@ impl Template {
             v2,
         ];
         for (i, entry) in self.table.iter_mut().enumerate() {
-            // Derivatives from the table itself, so that value and derivative belong to the same function. An entry
-            // serves the half step on either side of it.
+            // Derivatives from the table, so that value and derivative belong to the same function. An entry serves the half step
+            // on either side of it.
             let slope = (v[3] - v[1]) / 2.0;
             let bend = (v[4] - 2.0 * v[2] + v[0]) / 4.0;
             *entry = [v[2], slope, slope / step_px2, bend / step_px2].map(|e| e as f32);

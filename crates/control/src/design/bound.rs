@@ -1,9 +1,9 @@
 //! The smallest hold error that any controller can reach: the minimum-variance bound.
 //!
-//! The command of tick k acts on the position of tick k + 1 and knows measurements up to `d` samples before tick k
-//! only: `d + 1` samples of Brownian motion are out of reach, and so is what the best filter does not know of the
-//! position at the time of the newest measurement. Lags on the way from the command to the bead add to it where their sampled form cannot
-//! be inverted: a command that undid an error at once would have to grow from tick to tick.
+//! The command of tick k acts on the position of tick k + 1 and knows only measurements up to `d` samples before tick k. So `d +
+//! 1` samples of Brownian motion are out of reach, and so is the best filter's error of the position at the newest measurement.
+//! Lags between command and bead add to it if their sampled form cannot be inverted: a command that removed an error at once would
+//! grow from tick to tick.
 
 use crate::deviation::Deviation;
 use crate::loop_model::LoopModel;
@@ -75,8 +75,9 @@ mod tests {
 
     #[test]
     fn regulator_and_tube_behind_20_ms_cost_what_their_zeros_do() {
-        // K/(s (1 + 0.05 s)(1 + 0.02 s)): the sampled form has a zero at -b, outside the unit circle. An error e_k after a step of 1
-        // then has sum e_k (-b)^-k = b/(1 + b), whatever the controller, and the least sum of squares after e_0 is (b - 1)/(b + 1).
+        // K/(s (1 + 0.05 s)(1 + 0.02 s)): the sampled form has a zero at -b, outside the unit circle. An error e_k after a step of
+        // 1 then has sum e_k (-b)^-k = b/(1 + b), whatever the controller, and the least sum of squares after e_0 is (b - 1)/(b +
+        // 1).
         const B: f64 = 2.682_156;
         let (k, one, two) = (428.0, 0.05, 0.02);
         let model = LoopModel {

@@ -19,8 +19,8 @@ const GAIN: f64 = 2.0;
 const TRIED: i32 = 20;
 
 impl Lqg {
-    /// The law for a path whose camera has a frame each `frame_s`, s: the least weight that leaves the room of the module's text, the
-    /// usual one where none does.
+    /// The law for a path whose camera has a frame each `frame_s`, s: the least weight within the margin of the module's text; if
+    /// there is none, the usual weight.
     pub fn for_path(plant: &DesignPlant, frame_s: f64) -> Self {
         let usual = Self::default();
         // A frame a tick, or less: the usual weight answers that.

@@ -1,9 +1,8 @@
 //! The closed loop's response to an addition to the command at the harmonics of a periodic reference, for learning.
 //!
-//! From the running loop itself (estimator, controller, limits) on a noise-free plant, as the difference of two runs along
-//! the same reference, one with a small tone added: so the response is that in force on that reference, with the
-//! estimator's gains and the constraints that it has there. The same at the corners of the plant's uncertainty gives the
-//! bound that the convergence test needs.
+//! From the running loop itself (estimator, controller, limits) on a noise-free plant. It is the difference of two runs along the
+//! same reference, one with a small tone added. So it is the response in force on that reference, with the estimator's gains and
+//! the constraints there. The same at the corners of the plant's uncertainty gives the bound for the convergence test.
 
 use crate::controller::{Controller, ControllerConfig, LoopConfig};
 use crate::design::plant::DesignPlant;
@@ -23,7 +22,7 @@ const FIT_TICKS: (u64, u64) = (240, 10_000);
 /// The tone moves the bead by about this, um.
 const TONE_UM: f64 = 0.02;
 
-/// What a response is measured on.
+/// The conditions under which a response is measured.
 struct Bench<'a, R: ?Sized> {
     config: &'a LoopConfig,
     reference: &'a R,
@@ -103,8 +102,8 @@ fn response(with: &[f64], without: &[f64], first_tick: u64, ts: f64, hz: f64) ->
     })
 }
 
-/// Responses at harmonics 1 to `harmonics` of a periodic reference of `frequency_hz` that is in full swing from `from_s`
-/// on; harmonics above the range of learning are left out.
+/// Responses at harmonics 1 to `harmonics` of a periodic reference of `frequency_hz` that has its full amplitude from `from_s` on;
+/// harmonics above the range of learning are left out.
 ///
 /// # Errors
 /// A plant or a loop that cannot be built.

@@ -175,8 +175,8 @@ fn closed_loop(plant: &DiscretePlant, law: &LinearLaw) -> DMatrix<f64> {
     closed
 }
 
-/// Largest magnitude of an eigenvalue; NaN where it cannot be computed: entries that are no numbers, or so badly scaled that
-/// the iteration does not come to an end.
+/// Largest magnitude of an eigenvalue; NaN if it cannot be computed: the entries are NaN, or so badly scaled that the iteration
+/// does not end.
 fn spectral_radius(a: &DMatrix<f64>) -> f64 {
     /// Sweeps for each row; a sound matrix needs two or three.
     const SWEEPS: usize = 60;

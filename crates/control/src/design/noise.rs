@@ -1,8 +1,8 @@
 //! Predicted hold error: the discrete closed loop driven by Brownian motion and localisation noise.
 //!
-//! The true position's response to one step of the walk, and to one wrong fix, are square-summed: exact, without
-//! simulation of noise, and valid for any law that is stable (an integrating walk has no stationary state of its own,
-//! so that a Lyapunov equation of the whole loop has no solution).
+//! The squares of the true position's response to one step of the walk, and to one wrong fix, are summed. That is exact, without
+//! simulation of noise, and valid for any stable law. (An integrating walk has no stationary state, so a Lyapunov equation of the
+//! whole loop has no solution.)
 
 use crate::design::plant::DesignPlant;
 use crate::linear::LinearLaw;
@@ -25,7 +25,7 @@ pub struct NoiseFigures {
 /// What disturbs the loop once, at tick 0.
 #[derive(Clone, Copy, PartialEq)]
 enum Impulse {
-    /// The position jumps by 1 and is seen so many ticks later.
+    /// The position jumps by 1 and is seen this number of ticks later.
     Walk(usize),
     /// One fix is wrong by 1.
     Fix,

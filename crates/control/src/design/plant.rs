@@ -1,4 +1,4 @@
-//! What of a model the design works on, and what it says about the rest.
+//! The part of a model that the design uses, and the warnings about the rest.
 
 use crate::error::BuildError;
 use crate::loop_model::LoopModel;
@@ -84,8 +84,8 @@ pub struct DesignPlant {
 }
 
 impl DesignPlant {
-    /// The linear part of a model, for a loop delay that includes the half sample of hold; `None` takes the delay of
-    /// the model's own effects and of the camera path that it was measured with.
+    /// The linear part of a model, for a loop delay that includes the half sample of hold. `None` takes the delay of the model's
+    /// effects and of the camera path with which it was measured.
     ///
     /// # Errors
     /// Lags that make the plant's order too high.

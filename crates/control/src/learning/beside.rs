@@ -11,7 +11,7 @@ const PAST: usize = 24;
 pub struct CycleLearning {
     learner: Learner,
     state: LearnerState,
-    /// References of the last ticks, newest first, and how many of them count.
+    /// References of the last ticks, newest first, and their number.
     past_um: [f64; PAST],
     /// Jumps of the path at these ticks but the newest: the first is that of the tick before.
     jumps_um: [f64; PAST],
@@ -62,8 +62,8 @@ impl CycleLearning {
         self.state.feed_forward_gain().filter(|_| self.known > 0)
     }
 
-    /// After the controller's step: learns from a fix (position um, age of its exposure in ticks) that the controller
-    /// has used; `None`: there was none. `driven` is what the loop says of the tick.
+    /// After the controller's step: learns from a fix (position um, age of its exposure in ticks) that the controller has used;
+    /// `None` without a fix. `driven` is the loop's statement about the tick.
     pub fn learn(&mut self, fix: Option<(f64, f64)>, driven: &Driven) {
         let error = fix.and_then(|(position_um, age_ticks)| {
             let phase = self.phase - age_ticks * self.learner.advance;

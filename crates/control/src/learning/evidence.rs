@@ -1,8 +1,7 @@
 //! The error at the harmonics of the reference, from a stretch of ticks with a steady addition.
 //!
-//! The error is differenced in part first (`x_k = e_k - 0.9 e_(k-1)`), which makes what a loop leaves of Brownian motion about
-//! white, so that a stretch of three cycles is not read wrong by a bead that wanders slowly; the phasors are divided by the
-//! difference's own response.
+//! The error is differenced in part first (`x_k = e_k - 0.9 e_(k-1)`). That makes the rest of the Brownian motion nearly white, so
+//! a bead that wanders slowly does not spoil a stretch of three cycles. The phasors are divided by the response of the difference.
 
 use super::config::HARMONICS;
 use nalgebra::Complex;
@@ -16,7 +15,7 @@ const FIRST_NOISE_TICKS: f64 = 6.0;
 /// Ticks over which the noise is averaged.
 const NOISE_TICKS: f64 = 2000.0;
 
-/// What moves the bead along the reference in a tick, as the loop around the law has it; see [`crate::LoopOutput`].
+/// The part that moves the bead along the reference in a tick, as the loop around the law has it; see [`crate::LoopOutput`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Driven {
     /// Feed-forward of the law for the plant of the design, um of PZT from neutral; 0 for a law without.
@@ -163,7 +162,7 @@ impl Evidence {
         }
     }
 
-    /// Whether limits were met in so many ticks that an addition did not do what the response says.
+    /// Whether limits were met in so many of the ticks that an addition did not have its response.
     pub(super) fn is_limited(&self) -> bool {
         self.limited * 10 > self.ticks
     }
@@ -174,7 +173,7 @@ impl Evidence {
         (sums.error - sums.one * (self.sum / n)) * (2.0 / n)
     }
 
-    /// Phasor of the error at a harmonic of a reference of so many cycles a tick, um.
+    /// Phasor of the error at a harmonic of a reference of this many cycles a tick, um.
     pub(super) fn error(&self, harmonic: u32, advance: f64) -> Complex<f64> {
         self.differenced(harmonic) / through(harmonic, advance)
     }
@@ -185,7 +184,7 @@ impl Evidence {
         (sums.divided - sums.forward / gain) * (2.0 / f64::from(self.ticks.max(1)))
     }
 
-    /// The noise with that of this stretch: what is left beside the harmonics.
+    /// The noise with that of this stretch: the residual next to the harmonics.
     pub(super) fn noise(
         &self,
         harmonics: impl Iterator<Item = u32>,

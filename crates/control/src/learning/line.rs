@@ -16,7 +16,7 @@ const OTHER_RUN: f64 = 0.2;
 /// What is known of a harmonic.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Line {
-    /// Addition, um of PZT, and what it comes from while it changes.
+    /// Addition, um of PZT, and its source while it changes.
     pub theta: Complex<f64>,
     pub from: Complex<f64>,
     /// It is being learned.

@@ -1,4 +1,4 @@
-//! What a learner has learned, as it is kept in files: `learned.toml`.
+//! The result of a learner, as it is kept in files: `learned.toml`.
 
 use crate::uncertainty::Uncertainty;
 use serde::{Deserialize, Serialize};
@@ -15,7 +15,7 @@ pub struct LearnedHarmonic {
     pub sin_um: f64,
 }
 
-/// What a learner has learned, in the form of a file.
+/// The result of a learner, in the form of a file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LearnedTable {
@@ -32,8 +32,8 @@ pub struct LearnedTable {
     /// How well the plant was taken to be known in the convergence test; `None` in tables from before this was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub margins: Option<Uncertainty>,
-    /// Gain over the model's by which the feed-forward was divided beside the addition; `None` where nothing was learned, and
-    /// in tables of a loop that does not adapt: 1.
+    /// Gain over the model's by which the feed-forward was divided together with the addition. It is `None` if nothing was
+    /// learned, and 1 in tables of a loop that does not adapt.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub feed_forward_gain: Option<f64>,
     /// The harmonics.

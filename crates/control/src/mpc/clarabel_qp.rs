@@ -1,7 +1,7 @@
 //! The condensed QP by clarabel, set up once: a tick updates the vectors in place.
 //!
-//! Rows that no problem of this loop can reach are left out, the cost is scaled by its largest curvature, and
-//! equilibration and iterative refinement are off: on a problem of this size and scale they cost time and change nothing.
+//! Rows that no problem of this loop can reach are left out, the cost is scaled by its largest curvature, and equilibration and
+//! iterative refinement are off. On a problem of this size and scale they cost time and change nothing.
 
 use crate::active_set::{QpEnd, QpMatrices, QpVectors, Stop, VARS};
 use crate::error::BuildError;
@@ -20,8 +20,9 @@ const FAILED: BuildError = BuildError::NoConvergence {
 /// Tolerance of gap and residuals: with [`CURVATURE`] 0.1 nm of a plan of some um.
 const TOLERANCE: f64 = 1e-6;
 
-/// Largest curvature of the cost as the solver sees it. The point that clarabel begins from, and the balance of residuals and gap, hang on it:
-/// constrained problems of a loop take 13 iterations at 1, 8 at 1e5 (at most 12), and more again, some of them many, from 1e7 on.
+/// Largest curvature of the cost as the solver sees it. The starting point of clarabel, and the balance of residuals and gap,
+/// depend on it. Constrained problems of a loop take 13 iterations at 1 and 8 at 1e5 (at most 12). From 1e7 on they take more
+/// again, some of them many.
 const CURVATURE: f64 = 1e5;
 
 /// One side of a row.

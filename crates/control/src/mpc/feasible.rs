@@ -1,5 +1,4 @@
-//! What a solver that was stopped leaves is no plan yet: a point within the limits is made of it, and the best of what is at
-//! hand is followed.
+//! A solver that was stopped leaves no plan yet: its point is brought within the limits, and the best available point is followed.
 
 use crate::active_set::{ABSENT, QpMatrices, QpVectors, ROWS, VARS};
 

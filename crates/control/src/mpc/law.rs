@@ -44,7 +44,7 @@ pub struct MpcState {
     plan_um: [f64; HORIZON],
     /// Corrections of the newest plan.
     corrections: [f64; VARS],
-    /// Ticks of the plan already used; `HORIZON` when there is none.
+    /// Ticks of the plan already used; `HORIZON` without a plan.
     used: usize,
     working: WorkingSet,
     clarabel: Option<Box<ClarabelQp>>,
@@ -249,7 +249,7 @@ impl MpcLaw {
                 .zip(s)
                 .map(|(f, s)| f * s)
                 .sum();
-            // The path that range and slew leave of the reference is what is followed: what they forbid is no error.
+            // The law follows the reference as far as range and slew allow: their restriction is no error.
             *slot = state;
         }
         let mut start = 0;

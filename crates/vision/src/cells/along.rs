@@ -1,8 +1,8 @@
-//! What a whole row differs by. A wall goes on along the channel, a cell does not: what most of a row differs by alike is the wall as
-//! another place, focus or light draws it.
+//! Changes of whole rows. A wall continues along the channel, a cell does not: a change that most of a row shares is the wall,
+//! moved, out of focus or in another light.
 //!
-//! A straight line along the row takes in a channel that has turned. It is laid through two pieces of the row and must explain more
-//! of the others than no change does; those two do not count as explained, for any two pieces have a line.
+//! A straight line along the row covers a channel that has turned. It is drawn through two pieces of the row and must explain more
+//! of the others than no change does. Those two do not count, because any two pieces have a line.
 
 use super::background::Background;
 use super::drift::MOST_PX;
@@ -63,7 +63,8 @@ impl Line {
     }
 }
 
-/// What a row differs by, if a line within `range` explains more of it than no change. A piece that is off by `most` is unexplained.
+/// The change of a whole row, if a line within `range` explains more of it than no change. A piece that differs by `most` is
+/// unexplained.
 fn line_of(row: &Row, most: f32, range: f32) -> Option<Line> {
     let unexplained = most * most;
     let cost = |of: &dyn Fn(usize) -> f32| -> f32 {
@@ -110,8 +111,8 @@ fn medians(row: &[f32], length: usize) -> Row {
 }
 
 impl Background {
-    /// Largest difference of the background's levels in the rows that a shift brings to row `y`: a wall that moves or blurs takes no
-    /// level that is not near it.
+    /// Largest difference of the background's levels in the rows that a shift brings to row `y`: a wall that moves or blurs takes
+    /// only levels near it.
     fn range_about(&self, y: usize) -> f32 {
         let (reach, levels) = (MOST_PX.ceil() as usize, &self.row_levels);
         let near = levels.get(y.saturating_sub(reach)..(y + reach + 1).min(levels.len()));
@@ -124,7 +125,7 @@ impl Background {
         (high - low).max(0.0)
     }
 
-    /// Takes off a contrast what its whole rows differ by. A piece of a row that is off by less than `most` (grey levels) does not
+    /// Removes the changes of whole rows from a contrast. A piece of a row that differs by less than `most` (grey levels) does not
     /// stand out.
     pub(super) fn take_off_rows(&self, contrast: &mut [f32], most: f32) {
         let length = self.width / PIECES;

@@ -2,9 +2,9 @@
 
 /// Distance from a region within which the background is left alone, px.
 const CLEAR_PX: usize = 6;
-/// Pixels beside that, whose change stands for that behind the region.
+/// Pixels next to a region whose change is taken for that behind it.
 const BESIDE_PX: usize = 12;
-/// Each row of the background is refreshed once in so many frames.
+/// Number of frames in which each row of the background is refreshed once.
 const REFRESHED_EVERY: usize = 16;
 
 /// At most this many pixels serve for the estimate of a shift.
@@ -12,21 +12,21 @@ pub(super) const SAMPLES: usize = 384;
 
 /// Side of the patches that are restless or not, px.
 const PATCH: usize = 4;
-/// A patch is restless from so many times the scatter of the median one on, and from so many grey levels on.
+/// A patch is restless from this multiple of the median patch's scatter on, and from this number of grey levels on.
 const RESTLESS: (f32, f32) = (4.0, 4.0);
-/// Fewest frames that tell, and the share of them in which a patch must change: what swims past does so in few. Text is
-/// written into the outer quarter of a frame.
+/// Least number of frames for a judgement, and the share of them in which a patch must change: an object that swims past changes
+/// few. Text is written into the outer quarter of a frame.
 const FEWEST_RESTLESS: u32 = 8;
 const RESTLESS_SHARE: (u32, u32) = (2, 5);
-/// Patches beside a restless one that are taken for restless.
+/// Patches next to a restless one that count as restless.
 const BESIDE: usize = 2;
-/// About so many pixels serve for the estimate of the light.
+/// About this number of pixels gives the estimate of the light.
 const LIGHT_SAMPLES: usize = 2048;
-/// Ratios of a pixel to the background's are counted in so many classes from 0 on, and so many to a ratio of 1.
+/// Ratios of a pixel to the background's are counted in this number of classes from 0 on, with this number up to a ratio of 1.
 const LIGHT_BINS: usize = 1024;
 /// Groups that the place of a group moves on by from stretch to stretch.
 const GATHERED_AT: usize = 7;
-/// Every which of them is counted, and a change of the light that is none.
+/// Stride of the counted pixels, and the largest change of the light that does not count.
 const LIGHT_COUNTED: usize = 4;
 const LIGHT_SETTLED: f32 = 1e-5;
 const LIGHT_BINS_PER_ONE: f32 = 256.0;
@@ -35,16 +35,16 @@ const LIGHT_PASSES: usize = 4;
 /// First column and row of a region, and the first behind it, px.
 pub(super) type Bounds = [usize; 4];
 
-/// What a frame is compared with.
+/// The empty channel, with which a frame is compared.
 #[derive(Debug, Clone)]
 pub(super) struct Background {
     pub width: usize,
     pub mean: Vec<f32>,
     /// Sum of squared deviations from the running mean, over the pixels of each patch.
     deviations: Vec<f32>,
-    /// Patches whose grey levels change by themselves: text that counts the frames, a lamp in the picture.
+    /// Patches whose grey levels change without an object: text that counts the frames, a lamp in the picture.
     restless: Vec<bool>,
-    /// Squares of what the last frame differed by in each patch, and in how many frames that was much.
+    /// Squared differences of the last frame in each patch, and in how many frames they were large.
     last: Vec<f32>,
     active: Vec<u32>,
     sorted: Vec<f32>,
@@ -136,7 +136,7 @@ impl Background {
         }
     }
 
-    /// Whether a pixel belongs to a patch that changes by itself.
+    /// Whether a pixel belongs to a patch that changes without an object.
     pub(super) fn is_restless(&self, x: usize, y: usize) -> bool {
         let patch = y / PATCH * self.width.div_ceil(PATCH) + x / PATCH;
         self.restless.get(patch).copied().unwrap_or(false)
@@ -157,7 +157,7 @@ impl Background {
         }
     }
 
-    /// Takes a picture that is a mean already for the background; its noise is that of a frame beside it.
+    /// Takes a picture that is already a mean for the background; its noise is the difference of a frame from it.
     pub(super) fn be<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
@@ -170,8 +170,8 @@ impl Background {
         }
     }
 
-    /// Takes the noise from a frame: half of the differences from the background, about their median, are within 0.67
-    /// standard deviations of it, whatever swims in it. The least of several frames counts.
+    /// Takes the noise from a frame: half of the differences from the background, about their median, are within 0.67 standard
+    /// deviations of it, whatever swims in it. The least of several frames counts.
     pub(super) fn learn_noise<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
@@ -272,8 +272,9 @@ impl Background {
         }
     }
 
-    /// Light of the frame relative to the background's: where most pixels' ratios lie. Its median is a start that no header,
-    /// cell or wall within half of the frame draws away; then the mean of what lies within two standard deviations of it.
+    /// Light of the frame relative to the background's: the ratio of most pixels. The start is the median, which no header, cell
+    /// or wall within half of the frame can change much. The result is the mean of the ratios within two standard deviations of
+    /// it.
     pub(super) fn light_of<T: Copy>(&mut self, pixels: &[T]) -> f32
     where
         f32: From<T>,
@@ -329,7 +330,7 @@ impl Background {
         light
     }
 
-    /// Gathers groups of 8 pixels beside the background's, here and there.
+    /// Gathers groups of 8 pixels with the background's, spread over the frame.
     fn gather<T: Copy>(&mut self, pixels: &[T])
     where
         f32: From<T>,
@@ -363,7 +364,8 @@ impl Background {
     }
 }
 
-/// Value below which a share of the values is, each of them a whole grey level, so anywhere within half of one.
+/// Value below which a share of the values is. Each value is a whole grey level, so its true value is anywhere within half a
+/// level.
 fn quantile(values: &[f32], share: f64) -> f64 {
     let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(low, high), v| {
         (low.min(*v), high.max(*v))

@@ -1,25 +1,25 @@
 //! A frame that is shifted against the background: a chip or a stage that has crept or shakes.
 //!
-//! Walls are the strongest edges in a channel; a third of a pixel makes lines of them that join what is near. The shift is
-//! found by least squares at the background's own slopes, objects left out, and the background is moved by it.
+//! Walls are the strongest edges in a channel: a shift of a third of a pixel makes lines of them that join nearby objects. The
+//! shift is found by least squares at the background's own slopes, objects left out, and the background is moved by it.
 
 use super::background::{Background, SAMPLES};
 
 /// Largest shift that is made good, px.
 pub(super) const MOST_PX: f64 = 3.5;
-/// Shifts below this are none, px; and below so many standard deviations.
+/// Shifts below this count as zero, px; and below this number of standard deviations.
 const LEAST: (f64, f64) = (0.03, 4.0);
-/// Frames after which these are chosen anew.
+/// Frames after which the pixels are chosen again.
 const CHOSEN_EVERY: u32 = 4096;
 const PASSES: usize = 5;
 /// A step that changes nothing any more, px.
 const SETTLED_PX: f64 = 0.005;
-/// A shift up to here is told by the slopes at rest, px: it is none where it is below this share of the least one, or leaves more
-/// than this share of the squares.
+/// A shift up to here is measured by the slopes at rest, px. It does not count below this share of the least one, or if it leaves
+/// more than this share of the squares.
 const LINEAR_PX: f64 = 0.5;
 const STILL: f64 = 0.5;
 const ALIKE: f64 = 0.99;
-/// A shift is believed when it leaves at most this share of the squares, each counted up to so many standard deviations.
+/// A shift is believed if it leaves at most this share of the squares, each counted up to this number of standard deviations.
 const BETTER: f64 = 0.9;
 const MOST_OFF: f64 = 20.0;
 
@@ -85,7 +85,7 @@ impl Sums {
 
     /// The next step from a shift; `None` where there are no slopes.
     fn step(&self, at: (f64, f64), noise: f64) -> Option<Step> {
-        // A shift by a pixel is not expected: without slopes along a direction there is none.
+        // A shift by a pixel is not expected: without slopes along a direction the shift is zero.
         let least = noise * noise;
         let (xx, xy, yy) = (self.xx + least, self.xy, self.yy + least);
         let (rx, ry) = (self.rx - at.0 * least, self.ry - at.1 * least);
@@ -187,7 +187,7 @@ impl Background {
         self.steep = kept;
     }
 
-    /// Shift of the frame against the background, px to the right and down; noughts where there is none to speak of.
+    /// Shift of the frame against the background, px to the right and down; zeros if it is negligible.
     pub(super) fn drift_of<T: Copy>(&self, pixels: &[T], light: f32) -> (f64, f64)
     where
         f32: From<T>,

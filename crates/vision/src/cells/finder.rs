@@ -27,7 +27,7 @@ const MOST_REFRESHED_PX: f64 = 0.5;
 const KEPT_OUTLINES: usize = 8;
 /// Contrast that counts at most, in RMS contrasts of the region.
 const MOST_CONTRAST: f32 = 3.0;
-/// Share of the region's RMS contrast that another cell beside has: fringes are weaker.
+/// Share of the region's RMS contrast that another cell next to it has: fringes are weaker.
 const BESIDE: f64 = 0.6;
 /// Share of the cell's area that may lie beyond its halo.
 const MOST_BESIDE: f64 = 0.2;
@@ -41,7 +41,7 @@ pub struct CellFinder {
     background: Background,
     /// Signed contrast of the last frame, grey levels.
     contrast: Vec<f32>,
-    /// Room for another explanation of it.
+    /// Room for another explanation of the same pixels.
     other: Vec<f32>,
     regions: Regions,
     outliner: Outliner,
@@ -129,14 +129,14 @@ impl CellFinder {
         &self.config
     }
 
-    /// Whether outlines are laid through all rays and fitted in all passes, instead of through every other one of a large
-    /// cell and until nothing moves: what the fast way is compared with.
+    /// Whether outlines use all rays and all passes. The fast way uses every other ray of a large cell and stops when nothing
+    /// moves.
     pub fn set_thorough(&mut self, thorough: bool) {
         self.outliner.thorough = thorough;
     }
 
-    /// Says how far cells go while the next frames are exposed, from the start to the end of an exposure (px); noughts for a shutter
-    /// too fast to matter. The outline is that at mid-exposure.
+    /// Sets the motion of cells during the next frames, from the start to the end of an exposure (px); zeros for a shutter too
+    /// fast to matter. The outline is that at mid-exposure.
     pub fn expect_smear(&mut self, way_px: (f64, f64)) {
         self.outliner.expect_smear(way_px);
     }
@@ -159,8 +159,8 @@ impl CellFinder {
         Ok(())
     }
 
-    /// Takes one picture of the empty channel that is a mean of many for the background, in place of frames of it; the noise
-    /// must be learnt from frames then.
+    /// Takes one picture of the empty channel, a mean of many, for the background in place of frames; the noise must then be
+    /// learnt from frames.
     ///
     /// # Errors
     /// A frame of another size.
@@ -231,14 +231,14 @@ impl CellFinder {
         &self.cells
     }
 
-    /// Shift of the last frame against the background, px to the right and down, for which it was made good; noughts where
-    /// there was none to speak of.
+    /// Shift of the last frame against the background, px to the right and down, for which it was corrected; zeros if it was
+    /// negligible.
     pub fn drift_px(&self) -> (f64, f64) {
         self.moved.shift_px
     }
 
-    /// How much softer the last frame is than the background, px: the standard deviation of the Gaussian that the background was
-    /// blurred by before it was taken off; 0 for a frame in the background's focus.
+    /// How much softer the last frame is than the background, px: the standard deviation of the Gaussian by which the background
+    /// was blurred before it was subtracted; 0 for a frame in the background's focus.
     pub fn blur_px(&self) -> f64 {
         self.moved.blur_px
     }
@@ -263,8 +263,8 @@ impl CellFinder {
         self.regions.is_cluttered()
     }
 
-    /// Lets the background follow the frame last given to [`CellFinder::find`]: a sixteenth of the rows at a time, each by a
-    /// little. Near a region it changes as it does beside it, so that a cell is never taken in, however long it stays.
+    /// Lets the background follow the last frame given to [`CellFinder::find`]: a sixteenth of the rows at a time, each by a
+    /// little. Near a region it changes as the pixels around it do, so a cell is never taken in, however long it stays.
     pub fn refresh(&mut self, frame: &Frame) {
         // In quite another light it is not the background that has changed.
         let frames = self.config.refresh_frames;

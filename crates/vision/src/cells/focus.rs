@@ -1,8 +1,8 @@
 //! A frame that is softer than the background: the focus has crept, or the table shakes while a frame is exposed.
 //!
-//! To first order another focus blurs the picture by a Gaussian. Shift and blur are fitted together, by least squares at the
-//! background's steep pixels, objects left out, and the background is moved and blurred by them: a wall that is softer than it was
-//! leaves no contrast that could be taken for a cell.
+//! To first order another focus blurs the picture by a Gaussian. Shift and blur are fitted together by least squares at the
+//! background's steep pixels, objects left out. The background is then moved and blurred by them. So a softer wall leaves no
+//! contrast that could be taken for a cell.
 
 use super::background::Background;
 use super::drift::MOST_PX;
@@ -11,10 +11,10 @@ use nalgebra::{Matrix4, Vector4};
 
 /// Most blur that is made good, px (standard deviation).
 pub(super) const MOST_BLUR_PX: f64 = 4.0;
-/// Blur that is none, px: it is hidden in the pixels' own width, whose standard deviation this is.
+/// Blur that does not count, px: it is hidden in the pixels' own width, whose standard deviation this is.
 const LEAST_BLUR_PX: f64 = 0.29;
-/// Frame and background are both blurred by so many px first, so that a shift of several pixels is within reach of the slopes;
-/// then by less, then not at all.
+/// Frame and background are first blurred by this, px, so that the slopes reach a shift of several pixels; then by less, then not
+/// at all.
 const SOFTENED_PX: [f64; 3] = [2.0, 0.8, 0.0];
 const PASSES: usize = 10;
 /// Blur (px) that a fit starts from, one after the other.
@@ -23,13 +23,14 @@ const STARTS_PX: [f64; 2] = [0.0, 2.5];
 const SETTLED: (f64, f64) = (0.005, 0.01);
 /// Largest steps of shift (px) and blur (px^2).
 const STEP: (f64, f64) = (1.0, 2.0);
-/// A softer background must explain the pixels better by so much each, on average (minus the logarithm of the likelihood, with
-/// the weights' distribution): several times what four parameters gain from noise that neighbours share.
+/// Least gain per pixel by a softer background, on average (minus the logarithm of the likelihood, with the weights'
+/// distribution): several times the gain of four parameters from noise that neighbours share.
 const BETTER: f64 = 0.4;
-/// About so many of the steep pixels serve, and at least so many.
+/// About this number of steep pixels is used, and at least this number.
 const SAMPLES: usize = 160;
 const FEWEST: f64 = 12.0;
-/// A pixel that is off by so many standard deviations counts half: it may belong to an object (weights of Cauchy's distribution).
+/// A pixel that differs by this number of standard deviations counts half: it may belong to an object (weights of Cauchy's
+/// distribution).
 const OBJECT: f64 = 2.0;
 /// A pixel that is off by this many standard deviations of the noise counts half of its square.
 const FAR: f64 = 6.0;
@@ -39,10 +40,10 @@ const NARROWER: f64 = 0.7;
 const LIGHT: f64 = 0.02;
 /// So many pixels count as one against what is expected: neighbours are off alike.
 const ALIKE: f64 = 2.0;
-/// A shift of so many px is expected (standard deviation): what the slopes do not tell is not made up.
+/// Standard deviation of the expected shift, px: without slopes the shift stays near zero.
 const EXPECTED_PX: f64 = 2.0;
-/// Within so many standard deviations of the noise must be this share of the steep pixels where nothing has changed: half and 0.95
-/// of pixels with noise alone are, and an object may lie over a seventh of them.
+/// If nothing has changed, this share of the steep pixels is within this number of standard deviations of the noise. Of pixels
+/// with noise alone half and 0.95 are, and an object may cover a seventh of them.
 const CALM: ((f64, f64), (f64, f64)) = ((0.674, 0.43), (2.0, 0.8));
 
 /// How a frame differs from the background: moved, px, and softer by a Gaussian of this standard deviation, px.
@@ -93,8 +94,8 @@ struct Sums {
 }
 
 impl Background {
-    /// How the frame is moved and softened against the background. `last` is what the frame before was, and what that left: the
-    /// search goes on from there, and begins anew only for a frame that this does not explain as well.
+    /// How the frame is moved and softened against the background. `last` is the result for the previous frame, with its residual.
+    /// The search continues from it, and begins again only for a frame that it does not explain as well.
     pub(super) fn moved<T: Copy>(
         &self,
         softer: &Softer,
@@ -167,7 +168,7 @@ impl Background {
         best.moved
     }
 
-    /// The fit of shift and blur from a start, and what it leaves.
+    /// The fit of shift and blur from a start, with its residual.
     fn softened<T: Copy>(
         &self,
         softer: &Softer,
@@ -314,7 +315,7 @@ impl Background {
         let taps = kernel.taps();
         let mut sum = 0.0_f32;
         for (j, w) in (y - reach..).zip(taps) {
-            // The border goes on beyond it.
+            // The border continues beyond it.
             let j = j.clamp(0, height as isize - 1);
             let from = (j * self.width as isize + x - reach) as usize;
             let row = pixels.get(from..from + taps.len())?;
@@ -351,7 +352,7 @@ impl Background {
         Left::of(walls.map(|off| f64::from(*off)), self.noise_grey())
     }
 
-    /// What a frame differs by from the background at `light`, moved and blurred, into `contrast`; `row` has room for a row and
+    /// The difference of a frame from the background at `light`, moved and blurred, into `contrast`; `row` has room for a row and
     /// twice the reach.
     pub(super) fn contrast_moved<T: Copy>(
         &self,

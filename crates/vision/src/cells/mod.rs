@@ -79,8 +79,8 @@ pub struct Cell {
     pub snr: f64,
     /// Whether the outline is cut by the frame's border: then all of the above is that of a part.
     pub at_border: bool,
-    /// Whether another cell touches or overlaps it: the outline is not convex, has a waist, goes over a gap without an edge, or as much
-    /// lies outside of it as is a cell.
+    /// Whether another cell touches or overlaps it: the outline is not convex, has a waist, crosses a gap without an edge, or has
+    /// as much contrast outside as a cell.
     pub in_contact: bool,
 }
 

@@ -1,8 +1,8 @@
 //! Where something is: patches of 4 x 4 pixels whose RMS contrast stands out, joined.
 //!
-//! The square of the contrast counts, whatever its sign: a dark rim, a bright halo and a body hardly different from the
-//! background are one region. A gap of one patch is closed. The outermost patches are left out, so that lines along the
-//! border of a frame (a header written into the picture, a wall) do not join what is near them.
+//! The square of the contrast counts, whatever its sign: a dark rim, a bright halo and a body hardly different from the background
+//! are one region. A gap of one patch is closed. The outermost patches are left out, so that lines along the border of a frame (a
+//! header written into the picture, a wall) do not join objects near them.
 
 use super::background::Bounds;
 use crate::blobs::{Blob, Blobs};
@@ -18,7 +18,7 @@ const CORE: f64 = 0.4;
 const LONG: f64 = 1.4;
 /// Share of what is on either side that is left of the body between two objects.
 const GAP: f32 = 0.3;
-/// Most objects in a row that are told apart.
+/// Most objects in a row that are kept apart.
 const MAX_PARTS: usize = 4;
 /// Places along a region at which its body is summed, a patch long each.
 const BINS: usize = 512;
@@ -44,7 +44,7 @@ pub(super) struct Regions {
 
 impl Regions {
     pub(super) fn new(width: usize, height: usize, max_regions: usize) -> Self {
-        // The last patch of a row and of a column takes what is left over.
+        // The last patch of a row and of a column takes the remaining pixels.
         let (columns, rows) = ((width / PATCH).max(1), (height / PATCH).max(1));
         // A region shaped like a comb takes a label for each tooth.
         let room = 16 * max_regions;
@@ -60,8 +60,8 @@ impl Regions {
         }
     }
 
-    /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Bounds are kept of those that
-    /// are objects with the mean square `seed`.
+    /// Joins the patches of a frame's contrast above `threshold` (grey levels RMS). Keeps the bounds of those that are objects,
+    /// with the mean square `seed`.
     pub(super) fn find(&mut self, contrast: &[f32], width: usize, threshold: f32, seed: f64) {
         self.sum_patches(contrast, width);
         self.close();
@@ -171,7 +171,7 @@ impl Regions {
                     continue;
                 };
                 let mut value = *e;
-                // Neighbours among the outermost are none.
+                // Neighbours among the outermost do not count.
                 let (upper, lower) = (y > 1, y + 2 < rows);
                 let (left, right) = (x > 1, x + 2 < columns);
                 if left && right {
@@ -248,8 +248,8 @@ impl Regions {
         parts
     }
 
-    /// The ellipse with the same second moments as the part of a region that stands out at least by a share of its RMS
-    /// contrast, holes filled: faint fringes do not count.
+    /// The ellipse with the same second moments as the part of a region that exceeds a share of its RMS contrast, holes filled:
+    /// faint fringes do not count.
     pub(super) fn start(&self, blob: &Blob, part: &Part) -> Option<Start> {
         let (mut n, mut sx, mut sy, mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
         let strong = (CORE * CORE * blob.contrast_sum / blob.area_px) as f32;
@@ -295,8 +295,8 @@ impl Regions {
         })
     }
 
-    /// Columns and rows (first and last, px) that may hold the object: those of its region, and the outermost patches
-    /// beside it unless a line of quite another contrast runs there.
+    /// Columns and rows (first and last, px) that may hold the object: those of its region and the outermost patches next to it,
+    /// unless a line of quite another contrast is there.
     pub(super) fn room(&self, blob: &Blob, (width, height): (usize, usize)) -> [f32; 4] {
         let [left, top, right, bottom] = blob.bounds.map(|b| b as usize);
         let most = 2.0 * blob.peak as f32;

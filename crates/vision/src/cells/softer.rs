@@ -18,7 +18,7 @@ const REACH: f64 = 3.0;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Kernel {
     weights: [f32; TAPS],
-    /// Taps from `-reach` to `reach` are not nought.
+    /// Taps from `-reach` to `reach` are not zero.
     pub(super) reach: usize,
 }
 
@@ -53,7 +53,7 @@ impl Kernel {
         }
     }
 
-    /// Those of the weights that are not nought.
+    /// The weights that are not zero.
     pub(super) fn taps(&self) -> &[f32] {
         let from = MOST_REACH - self.reach;
         self.weights
@@ -79,8 +79,8 @@ impl Softer {
         }
     }
 
-    /// Takes the background in: all of it once its steep pixels have been chosen for the first time, a row of one blur then. `row` has
-    /// room for a row and twice the reach.
+    /// Takes the background in: all of it once its steep pixels have been chosen for the first time, then a row of one blur at a
+    /// time. `row` has room for a row and twice the reach.
     pub(super) fn follow(&mut self, background: &Background, row: &mut [f32]) {
         let rows = READY_PX.len() * background.mean.len() / background.width.max(1);
         let count = if background.steep_age == 1 { rows } else { 1 };
@@ -223,7 +223,7 @@ fn cubic_slope(t: f32) -> [f32; 4] {
 }
 
 impl Background {
-    /// A row of the mean blurred downwards, into the middle of `row`; the border goes on beyond it on either side.
+    /// A row of the mean blurred downwards, into the middle of `row`; the border continues beyond it on either side.
     pub(super) fn row_blurred<'r>(&self, y: usize, down: &Kernel, row: &'r mut [f32]) -> &'r [f32] {
         let (width, height) = (self.width, self.mean.len() / self.width.max(1));
         row.fill(0.0);

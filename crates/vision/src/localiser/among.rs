@@ -10,14 +10,14 @@ use crate::frame::Frame;
 use crate::reach::extent_px;
 use crate::streak::Comb;
 
-/// Share of a bead's contrast below which a bad fit beside it is no bead.
+/// Share of a bead's contrast below which a bad fit next to it is no bead.
 const LEAST_SHARE: f64 = 0.3;
 /// Rounds in which fits and images taken off improve each other; the last one counts. The error falls by the overlap each time.
 const ROUNDS: usize = 3;
 
 impl Localiser {
     /// Positions of all beads near the places given (px), into `fixes`: one a bead, of any verdict. Beads whose images overlap are
-    /// fitted beside each other.
+    /// fitted together.
     pub fn locate_all(
         &mut self,
         frame: &Frame,
@@ -55,7 +55,7 @@ impl Localiser {
                     let off_px2 = squared(f.x_px - own.x_px, f.y_px - own.y_px);
                     off_px2 > 0.0 && off_px2 <= reach_px * reach_px
                 };
-                // Two beads may be a bad fit because of each other; what is much weaker is none.
+                // Two beads may each be a bad fit because of the other; a much weaker one is no bead.
                 let is_bead = |f: &&Fix| {
                     f.verdict == FixQuality::Good
                         || f.verdict == FixQuality::BadFit

@@ -7,14 +7,14 @@ use crate::lines;
 /// Contrast of a bead over its own standard deviation. Noise alone exceeds it in one of 10^10 places: once in 10,000 frames
 /// of 500 x 500 px, whatever the size of the beads.
 pub(super) const LEAST_SIGNIFICANCE: f64 = 6.4;
-/// The same beyond what the lines through it explain: few places have one, and noise was asked before.
+/// The same beyond the explanation by the lines through it: few places have one, and noise was asked before.
 const BEYOND_LINES: f64 = 5.5;
 /// From so much on, lines are not asked: they would have to be as strong as the bead.
 const BEYOND_DOUBT: f64 = 5.0 * LEAST_SIGNIFICANCE;
 
 impl Localiser {
-    /// Whether a fit's contrast is beyond noise, and beyond what the rows and columns through the bead explain. What widens
-    /// the variance of the place widens that of the contrast.
+    /// Whether a fit's contrast is beyond noise, and beyond the part that the rows and columns through the bead explain. Whatever
+    /// widens the variance of the place widens that of the contrast.
     pub(super) fn is_certain(&self, pass: &Pass, at: (f64, f64), widening: f64) -> bool {
         let unit = self.weight_unit();
         let variance = unit * widening * pass.amplitude_variance;

@@ -1,4 +1,4 @@
-//! What comes after the first fit: specks are left out, and rising light and another focus are fitted where the window asks.
+//! The steps after the first fit: specks are left out, and rising light and another focus are fitted if the window asks for them.
 
 use super::judge::WIDENED_RATIO;
 use super::view::View;
@@ -8,10 +8,10 @@ use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
 
-/// How often specks are looked for in what a fit leaves: each time those half as strong as the strongest are left out.
+/// How often specks are searched in the residual of a fit: each time those at least half as strong as the strongest are left out.
 const MOST_LOOKS_FOR_SPECKS: usize = 5;
 
-/// Share of what a fit leaves beyond noise that offsets of the lines must explain to count.
+/// Least share of a fit's excess residual that offsets of the lines must explain to count.
 const LEAST_OF_LINES: f64 = 0.5;
 
 impl Localiser {
@@ -67,7 +67,7 @@ impl Localiser {
             left?,
         );
         let level = f.pass.background + f64::from(self.crop.pedestal);
-        // Where what is left is wider or more than noise, a score of it is, too.
+        // If the residual is wider or larger than noise, its score is, too.
         let asked = l.asks(self.pixel_variance(level) * self.widened.mean.max(1.0));
         if !asked.slopes && !asked.size {
             return Some(f);

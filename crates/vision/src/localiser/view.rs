@@ -1,4 +1,4 @@
-//! What a fix looks at: the frame, and the beads whose images are taken off its windows.
+//! The input of a fix: the frame, and the beads whose images are removed from its windows.
 
 use crate::fix::Fix;
 use crate::frame::Frame;
@@ -11,7 +11,7 @@ const MOST_OTHERS: usize = 8;
 pub(super) struct View<'a> {
     pub frame: &'a Frame<'a>,
     pub others: Others,
-    /// Whether this fix is one of those on the way to a better one: nothing is learnt from it.
+    /// Whether this fix is an intermediate step to a better one: nothing is learnt from it.
     pub is_draft: bool,
     /// Whether a residual that is the same all round counts as none.
     pub pardons: bool,

@@ -11,7 +11,7 @@ const MOST_BEND: usize = 3;
 /// Standard deviations of the noise that the step must have on average.
 const LEAST_STEP: f32 = 1.0;
 
-/// A step is like another from this share of it on.
+/// From this share of a step on another step is like it.
 const ALIKE: f32 = 0.65;
 
 /// The best that leads to each step of a ray, with room beyond both ends, which nothing comes from.
@@ -80,7 +80,7 @@ impl Outliner {
         Some(polarity)
     }
 
-    /// A ray of so many, in steps from inside to outside.
+    /// One ray of the given number, in steps from inside to outside.
     fn ray(start: &Start, (ray, rays): (usize, usize), inward_px: f64, step_px: f64) -> Ray {
         let (sin, cos) = (core::f64::consts::TAU * ray as f64 / rays as f64).sin_cos();
         let (s, c) = start.angle_rad.sin_cos();
@@ -114,7 +114,7 @@ impl Outliner {
         }
     }
 
-    /// Means over the rays of the largest step of a sign, and of where it is.
+    /// Means over the rays of the largest step of a sign, and of its place.
     fn potential(&self, rays: usize, sign: f32) -> (f32, f32) {
         let (mut sum, mut places) = (0.0, 0.0);
         for found in self.scores.iter().take(rays) {
@@ -131,7 +131,8 @@ impl Outliner {
         (sum / n, places / n)
     }
 
-    /// What speaks for the contour at each step of each ray, in the place of the steps: the step there, less what of the body's sign lies outside.
+    /// The evidence for the contour at each step of each ray, in place of the steps: the step there, less the contrast of the
+    /// body's sign outside.
     fn score(&mut self, rays: usize, polarity: f32, noise: f32, step_px: f32) {
         let steps = self.steps;
         for (samples, scores) in self.samples.iter().zip(&mut self.scores).take(rays) {

@@ -9,18 +9,18 @@
 use super::normals::{Profile, dot};
 use super::{FINE_PX, MAX_FINE, RIM_PX};
 
-/// An object hardly larger than its edge is wide loses contrast to the blur, so that half of what is left lies outside of
-/// it: from this ratio of the edge's width to the radius on, share of the rim's contrast per ratio, and at most.
+/// If an object is hardly larger than the width of its edge, it loses contrast to the blur, and half of the rest is outside of it.
+/// From this ratio of the edge's width to the radius on; share of the rim's contrast per ratio; at most.
 const BLURRED: (f64, f64, f64) = (0.15, 1.8, 0.25);
-/// The edge's width is taken between these shares of the swing from halo to rim, and counted so many times.
+/// The edge's width is taken between these shares of the swing from halo to rim, times this number.
 const WIDTH: (f64, f64, f64) = (0.15, 0.85, 1.4);
-/// A halo weaker than this share of the rim is none.
+/// A halo weaker than this share of the rim does not count.
 const NO_HALO: f64 = 0.06;
 /// Share of the profile (RMS) that a fitted phase edge may leave.
 const MOST_LEFT: f64 = 0.12;
 /// Lobes, as a share of the step, from which on the fitted edge counts, and from which on it alone counts.
 const LOBES: (f64, f64) = (0.1, 0.18);
-/// Share of what a step without lobes leaves that one with lobes may leave.
+/// Largest residual of a step with lobes, as a share of that without lobes.
 const LESS_LEFT: f64 = 0.3;
 /// Farthest that the middle of a phase edge is looked for, px.
 const REACH_PX: f64 = 4.5;
@@ -28,7 +28,7 @@ const REACH_PX: f64 = 4.5;
 const ROUGHLY: (f64, f64) = (4.0, 0.5);
 /// Widths of the blur that are tried, px.
 const BLURS_PX: [f64; 5] = [0.7, 1.0, 1.4, 2.0, 2.8];
-/// About the best of those tried; from a start that is guessed; about the best of that.
+/// About the best of those tried; from a guessed start; about the best of that.
 const NEAR: Search = Search {
     step_px: 0.5 * FINE_PX,
     factor: 1.19,
@@ -83,8 +83,8 @@ pub(super) struct Shapes {
 /// Places along a normal relative to an edge that is tried, in steps.
 const TRIED: usize = 2 * (MAX_FINE + (REACH_PX / FINE_PX) as usize) + 1;
 
-/// The shapes of one blur about an edge in the middle, and sums of their products up to each place: step with itself, with
-/// lobes, with rim, lobes with themselves, rim with itself.
+/// The shapes of one blur about an edge in the middle, and sums of their products up to each place: step with itself, with lobes,
+/// with rim, lobes with themselves, rim with itself.
 #[derive(Debug, Clone)]
 struct Tried {
     blur_px: f64,
@@ -218,8 +218,8 @@ impl Profile {
         Some(found(at_px + trust * weight * (model_px - at_px)))
     }
 
-    /// Middle of the blurred step with lobes and rim near a place and of about a width (px), px outside the profile's middle,
-    /// and how far that is to be believed, 0 to 1: where it leaves next to nothing of the profile no level tells more.
+    /// Middle of the blurred step with lobes and rim near a place and of about a width (px), px outside the profile's middle, and
+    /// its credibility, 0 to 1. If it leaves next to nothing of the profile, no level is more exact.
     fn model(&self, shapes: &Shapes, (near_px, width_px): (f64, f64)) -> (f64, f64) {
         let values = self.values.iter().take(2 * self.half + 1);
         let power: f64 = values.map(|v| v * v).sum();
@@ -251,7 +251,7 @@ impl Profile {
     }
 
     /// Middle of the blurred step that fits the profile with an outer lobe of the step's own sign, px outside the profile's
-    /// middle, and how far that is to be believed, 0 to 1; `None` where none does.
+    /// middle, and its credibility, 0 to 1; `None` if no step does.
     fn phase_edge(&self, shapes: &Shapes) -> Option<(f64, f64)> {
         let values = self.values.iter().take(2 * self.half + 1);
         let power: f64 = values.map(|v| v * v).sum();
@@ -278,7 +278,7 @@ impl Profile {
         (best.left < LESS_LEFT * plain.left).then_some((best.at_px, weight))
     }
 
-    /// The best fit of a blurred step with what is said of those that are tried.
+    /// The best fit of a blurred step among those tried.
     fn tried(&self, shapes: &Shapes, with: With) -> PhaseEdge {
         let reach_px = REACH_PX.min(0.5 * self.half as f64 * FINE_PX + 1.0);
         let places = (reach_px / FINE_PX) as usize;
@@ -464,7 +464,7 @@ struct Search {
     rounds: usize,
 }
 
-/// What is fitted beside the step.
+/// The columns that are fitted together with the step.
 #[derive(Debug, Clone, Copy)]
 enum With {
     Lobes,

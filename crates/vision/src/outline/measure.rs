@@ -1,4 +1,4 @@
-//! What the contour encloses, and how well that is known.
+//! Moments of the area inside the contour, and their uncertainty.
 
 use super::{BORDER_PX, Contrast, Outline, Outliner, normals};
 
@@ -85,7 +85,7 @@ impl Outliner {
             *known = profile.information();
         }
         let mut c = [0.0; 6];
-        // Integrals along the contour, of 1 and of what a point adds to the moments.
+        // Integrals along the contour: of 1, and of a point's contribution to the moments.
         let mut around = [0.0; 4];
         let (mut place, mut area_variance, mut point_variance) = ([0.0; 3], 0.0, 0.0);
         for i in 0..n {

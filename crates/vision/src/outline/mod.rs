@@ -17,7 +17,7 @@ pub(crate) const MAX_RAYS: usize = 128;
 const MIN_RAYS: usize = 48;
 /// Most steps along a ray.
 const MAX_STEPS: usize = 48;
-/// Rays that the dynamic programming goes on past the start, so that the contour closes: a quarter on either side.
+/// Rays by which the dynamic programming continues past the start, so that the contour closes: a quarter on either side.
 const OVERLAP: usize = 24;
 /// Distance of the steps along a normal, px.
 const FINE_PX: f64 = 0.5;
@@ -35,8 +35,8 @@ const BEND: f32 = 0.08;
 const OUTSIDE: f32 = 0.12;
 /// Depth over which the rim's contrast is taken, px.
 const RIM_PX: f64 = 4.0;
-/// Ratio of the half axes up to which a profile is the same all round, so that a model of it tells the edge, and from which
-/// on it is not: the tips of a cell that is pressed thin are all edge.
+/// Ratio of the half axes up to which a profile is the same all round, so that a model of it gives the edge, and the ratio from
+/// which on it is not: the tips of a cell that is pressed thin are all edge.
 const ROUND: (f64, f64) = (1.6, 2.6);
 /// How far the profiles reach on either side, as a share of the contour's short half axis.
 const REACH: f64 = 0.6;
@@ -97,7 +97,7 @@ impl Contrast<'_> {
     }
 }
 
-/// The first and the last step (numbers that need not be whole, none where the last is before the first) at which `start` and a
+/// The first and the last step (numbers that need not be whole, none if the last is before the first) at which `start` plus a
 /// multiple of `step` is between two places.
 fn steps_between((start, step): (f64, f64), (low, high): (f64, f64)) -> (f64, f64) {
     // Rounding in fixed point stays inside.
@@ -138,7 +138,7 @@ pub(crate) struct Outline {
     pub moment_variances: [f64; 6],
     /// Contrast of the rim, signed.
     pub rim_grey: f64,
-    /// Contrast of the halo, signed; of the same sign as the rim, or 0, where there is none.
+    /// Contrast of the halo, signed; of the same sign as the rim, or 0, without a halo.
     pub halo_grey: f64,
     /// Area over that of the convex hull.
     pub solidity: f64,
@@ -237,7 +237,7 @@ impl Outliner {
                 break;
             }
         }
-        // The contour may lie on a lobe beside the edge: about the edge itself the profile does not depend on the start.
+        // The contour may be on a lobe next to the edge: about the edge itself the profile does not depend on the start.
         let near = profile?.edge(self.radius_px(), &self.shapes, 0.0)?;
         self.find_normals();
         self.shift_outwards(near.at_px);

@@ -8,7 +8,7 @@ pub(super) type Values = [f32; 2 * MAX_FINE + 1];
 
 /// Farthest that a normal's profile is shifted in one pass, px.
 const MOST_SHIFT_PX: f64 = 1.0;
-/// Share of the pixels' noise variance that is left in a shift: values between the pixels are means of them.
+/// Share of the pixels' noise variance that remains in a shift: values between the pixels are means of pixels.
 const INTERPOLATED: f64 = 0.75;
 /// Amplitudes of a normal's profile that count as the same rim, relative to the mean one.
 pub(super) const AMPLITUDES: (f64, f64) = (0.25, 4.0);
@@ -26,9 +26,9 @@ pub(super) struct Profile {
     wider: usize,
 }
 
-/// Ways along a normal that are told apart when a cell is smeared.
+/// Number of ways along a normal for a smeared cell.
 pub(super) const WAYS: usize = 8;
-/// A way over which a cell is smeared that is none, px: it widens an edge by a twelfth of its square.
+/// A smear of a cell below this does not count, px: it widens an edge by a twelfth of its square.
 const LEAST_SMEAR_PX: f64 = 1.0;
 /// Rounds in which the mean profile is freed of the smear.
 const SHARPENED: usize = 6;
@@ -40,7 +40,7 @@ const CURVED: usize = 4;
 pub(super) struct Smear {
     /// Way of the cell during the exposure, px.
     pub(super) way_px: (f64, f64),
-    /// The mean profile along normals that stand across the motion, smeared over none of the way up to all of it.
+    /// The mean profile along normals across the motion, smeared over none of the way up to all of it.
     pub(super) profiles: Vec<Profile>,
 }
 
@@ -54,7 +54,7 @@ impl Smear {
 
     fn length_px(&self) -> f64 {
         let length_px = f64::hypot(self.way_px.0, self.way_px.1);
-        // The comparison also turns away what is not a number.
+        // The comparison also refuses a NaN.
         if length_px > LEAST_SMEAR_PX && length_px < MAX_FINE as f64 {
             length_px
         } else {
@@ -62,8 +62,8 @@ impl Smear {
         }
     }
 
-    /// Standard deviation of what the smear of an object of a radius moves its contour by, px: the edge recedes by up to a 24th of the
-    /// squared way over the radius, which the model makes good to first order; so much again and half of it is left.
+    /// Standard deviation of the contour's shift by the smear of an object of a radius, px. The edge recedes by up to a 24th of
+    /// the squared way over the radius, which the model corrects to first order. As much again and half of it remains.
     pub(super) fn left_px(&self, radius_px: f64) -> f64 {
         self.length_px().powi(2) / (16.0 * radius_px.max(1.0))
     }
@@ -122,7 +122,7 @@ impl Outliner {
         }
     }
 
-    /// Mean profile, and each normal's shift against it by least squares beside amplitude and offset, into `shifts`.
+    /// Mean profile, and each normal's shift against it by least squares, with amplitude and offset, into `shifts`.
     pub(super) fn align(&mut self, half: usize, polarity: f64) -> Option<Profile> {
         let profile = self.mean(half, polarity);
         let mut fits = [const { None }; WAYS + 1];
@@ -148,7 +148,7 @@ impl Outliner {
         Some(profile)
     }
 
-    /// The mean profile, into `smear` as it is along each angle with the motion: that which, smeared, leaves nothing of the normals'
+    /// The mean profile, into `smear` as it looks along each angle with the motion. Smeared, it leaves nothing of the normals'
     /// profiles on average (Van Cittert's iteration, which few rounds keep smooth).
     fn mean(&mut self, half: usize, polarity: f64) -> Profile {
         let count = 2 * half + 1;
@@ -187,8 +187,8 @@ impl Outliner {
         profile
     }
 
-    /// Moves the points out by what a motion along the contour has taken from it: the edge of what is round recedes on either side
-    /// of the middle of the exposure.
+    /// Moves the points out by the distance that a motion along the contour has taken: the edge of a round object recedes on
+    /// either side of the middle of the exposure.
     pub(super) fn shift_by_smear(&mut self) {
         let n = self.points.len();
         if self.smear.length_px() <= 0.0 || n <= 2 * CURVED {
@@ -226,7 +226,7 @@ impl Outliner {
         (squares / n.max(1) as f64).sqrt()
     }
 
-    /// Puts a point between each two of a contour that was laid through half of them, on the cubic through four.
+    /// Puts a point between each two of a contour that was drawn through half of them, on the cubic through four.
     pub(super) fn refine(&mut self) {
         let n = self.points.len();
         if 2 * n > self.rays {
@@ -253,7 +253,7 @@ impl Outliner {
         }
     }
 
-    /// Mean square of what the mean profile leaves of the normals' profiles, grey^2.
+    /// Mean square of the normals' profiles less the mean profile, grey^2.
     pub(super) fn residual(&self) -> f64 {
         let (mut sum, mut n) = (0.0, 0.0);
         let rays = self.profiles.iter().zip(&self.shifts).zip(&self.amplitudes);
@@ -297,7 +297,7 @@ impl Profile {
         }
     }
 
-    /// The profile smeared over a way, px: the mean of it along the way. It goes on beyond its ends as it is there.
+    /// The profile smeared over a way, px: its mean along the way. Beyond its ends it keeps the end values.
     fn smeared(&self, px: f64) -> Self {
         let count = 2 * self.half + 1;
         let steps = px / FINE_PX;

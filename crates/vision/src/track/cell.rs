@@ -1,9 +1,9 @@
 //! Following one cell from frame to frame, by the same states and decisions as a bead.
 //!
-//! A cell has no template: what tells it from another is where it must be, the contrast of its body, and its size. It may
-//! stretch to several times its length, but then its surface stays (a cell flat between two walls) or its volume does (a
-//! body of revolution); one of the two must agree. Two cells that touch are one outline of another size: it is not taken, nor is
-//! what stays where it is while cells pass.
+//! A cell has no template. Its expected place, the contrast of its body and its size distinguish it from others. It may stretch to
+//! several times its length, but then its surface stays (a cell flat between two walls) or its volume does (a body of revolution);
+//! one of the two must agree. Two cells that touch are one outline of another size, which is not taken. An object that keeps its
+//! place while cells pass is not taken either.
 
 use super::config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use super::motion::{Motion, Randomness};
@@ -76,7 +76,7 @@ impl CellTracker {
         })
     }
 
-    /// Outline (px) of a cell of the last frame; empty where it is not kept.
+    /// Outline (px) of a cell of the last frame; empty if it is not kept.
     pub fn outline(&self, cell: &Cell) -> &[(f64, f64)] {
         let same = |found: &Cell| (found.x_px, found.y_px) == (cell.x_px, cell.y_px);
         let number = self.finder.found().iter().position(same);

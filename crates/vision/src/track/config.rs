@@ -1,10 +1,10 @@
-//! Settings of the tracker, and what it says about each frame.
+//! Settings of the tracker, and its statements about each frame.
 
 use crate::config::ConfigError;
 use crate::fix::Fix;
 use serde::{Deserialize, Serialize};
 
-/// What was commanded, as far as the next frame goes.
+/// The commanded motion up to the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Commanded {
     /// Mean flow velocity since the frame before, px/s.
@@ -12,9 +12,9 @@ pub struct Commanded {
     /// Way that the flow goes while the frame is exposed, px: a fast bead's image is drawn out along it. Noughts where the
     /// exposure is not known.
     pub streak_px: (f64, f64),
-    /// What the second half of that way is longer than the first, px.
+    /// Length of the second half of that way less the first, px.
     pub turn_px: (f64, f64),
-    /// Exposure time, s; 0 where it is not known.
+    /// Exposure time, s; 0 if unknown.
     pub exposure_s: f64,
 }
 
@@ -57,8 +57,8 @@ pub struct TrackerConfig {
     pub max_size_change: f64,
     /// Largest residual ratio, in multiples of the tracked bead's (at least of 1), unless the bead is alone in the picture.
     pub max_residual_growth: f64,
-    /// How much better (difference of minus twice the log likelihood) one reading of the frame must be than another
-    /// before the bead is told from a neighbour.
+    /// How much better (difference of minus twice the log likelihood) one reading of the frame must be than another to separate
+    /// the bead from a neighbour.
     pub certainty: f64,
     /// Frames between looks for neighbours while none is near.
     pub neighbour_stride: u32,
@@ -87,7 +87,7 @@ impl Default for TrackerConfig {
 }
 
 impl TrackerConfig {
-    /// The defaults for another size of the pixel: what they mean in micrometres stays.
+    /// The defaults for another size of the pixel: their values in micrometres stay.
     pub fn for_pixel_um(pixel_um: f64) -> Self {
         let scale = 0.1 / pixel_um;
         let default = Self::default();
@@ -247,7 +247,7 @@ pub enum Decision {
     OutsideGate = 7,
     /// A bead at the right place with another intensity, size or residual.
     OtherBead = 8,
-    /// It cannot be told which of two beads it is.
+    /// Two readings of the frame, one for each of two beads, are equally good.
     Ambiguous = 9,
     /// The fix was taken after coasting.
     Regained = 10,
@@ -257,7 +257,7 @@ pub enum Decision {
     NoFrame = 12,
     /// The frame came twice, out of order or with an old time stamp, and was not looked at.
     Stale = 13,
-    /// What there is stays where it is while cells pass: dirt, a wall.
+    /// The object stays in its place while cells pass: dirt, a wall.
     Stays = 14,
     /// Another cell touches it, so that its size is not its own.
     InContact = 15,

@@ -89,9 +89,9 @@ impl Identity {
         self.mean.change_used(config, fix, size).max(residual)
     }
 
-    /// Whether a fix has the contrast and the size of the last one: a bead that swims over dust changes from frame to frame, and by
-    /// much in all. What dust adds is in the residual, whose limit for a good fix is a share of the contrast: as a multiple of
-    /// the noise it says nothing of which bead this is.
+    /// Whether a fix has the contrast and the size of the last one: a bead that swims over dust changes from frame to frame, and
+    /// by much in all. Dust shows in the residual, whose limit for a good fix is a share of the contrast. As a multiple of the
+    /// noise it does not identify the bead.
     pub(super) fn goes_on(
         &self,
         config: &TrackerConfig,

@@ -1,4 +1,5 @@
-//! What stays where it is while cells pass: dirt on the glass, a fold of the wall. Told by that alone, whatever its look.
+//! Objects that keep their place while cells pass: dirt on the glass, a fold of the wall. Only that identifies them, whatever
+//! their look.
 //!
 //! An object that has kept its place for some frames stays once the commanded flow would have carried a cell away from there, or
 //! the cell that is followed has gone its own width. The cell that is followed never counts: the loop holds it still.
@@ -41,8 +42,8 @@ impl Still {
 }
 
 impl Stays {
-    /// Takes in the objects of a frame; `carried_px` is what the commanded flow moves in it since the frame before, and
-    /// `followed` the cell that is followed where it was seen in this frame.
+    /// Takes in the objects of a frame. `carried_px` is the motion by the commanded flow since the previous frame, and `followed`
+    /// the followed cell if it was seen in this frame.
     pub(super) fn see(&mut self, cells: &[Cell], carried_px: (f64, f64), followed: Option<&Cell>) {
         let place = followed.map(|c| (c.x_px, c.y_px));
         for slot in &mut self.still {
