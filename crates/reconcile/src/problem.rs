@@ -93,16 +93,16 @@ impl Prepared {
         dot(&e, &e) + whitener.log_determinant() + free.log_determinant()
     }
 
-    /// What the transients and a level (and, where asked for, a ramp) leave of a residual.
+    /// A residual, or its first rows, without the transients, a level and, if asked for, a ramp.
     pub(crate) fn without_start(&self, residual: &[f64], ramp: bool) -> Vec<f64> {
         let n = residual.len();
         let mut columns: Vec<Vec<f64>> = vec![vec![1.0; n]];
         if ramp {
             columns.push((0..n).map(|k| k as f64 / n as f64 - 0.5).collect());
         }
-        columns.extend(self.transients.iter().cloned());
+        columns.extend(self.transients.iter().map(|c| c[..n].to_vec()));
         if self.drifts {
-            columns.push(self.flow.drift.clone());
+            columns.push(self.flow.drift[..n].to_vec());
         }
         let mut basis: Vec<Vec<f64>> = Vec::new();
         let mut left = residual.to_vec();

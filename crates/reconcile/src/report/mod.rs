@@ -431,7 +431,7 @@ fn free_run_noise(result: &Reconciliation) -> String {
         "a level"
     };
     format!(
-        "Free runs of both models from the start of each record, less {off}, as in the gap. A right model still leaves {}.",
+        "Free runs of both models from the start of each record, each moved by {off}. A right model still leaves {}.",
         left.join(", and ")
     )
 }

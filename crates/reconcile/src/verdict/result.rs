@@ -196,7 +196,7 @@ pub struct Trace {
     pub time_s: Vec<f64>,
     /// Measured position, NaN where missing \[um\].
     pub measured_um: Vec<f64>,
-    /// Free run of the null model, without the motions that every fit leaves free: level, start, ramp \[um\].
+    /// Free run of the null model, moved by the level, the ramp and the start that agree best with this stretch \[um\].
     pub before_um: Vec<f64>,
     /// The same for the augmented model \[um\].
     pub after_um: Vec<f64>,
@@ -229,8 +229,8 @@ impl Traces {
                     .collect()
             };
             let (left_before, left_after) = (
-                r.without_start(&before[i], ramp),
-                r.without_start(&after[i], ramp),
+                r.without_start(&before[i][..n], ramp),
+                r.without_start(&after[i][..n], ramp),
             );
             Trace {
                 record: r.name.clone(),
