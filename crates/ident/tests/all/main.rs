@@ -4,3 +4,4 @@ mod closed_loop;
 mod common;
 mod frequency_response;
 mod measured_piezo;
+mod slow_actuator;

@@ -64,6 +64,8 @@ pub struct Acquired {
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,
+    /// Places in the plan of the segments in which the bead left the view.
+    pub out_of_view: Vec<usize>,
     /// Why segments are missing, if any are.
     pub trouble: Option<Trouble>,
     /// Folder of the run.
@@ -336,10 +338,14 @@ impl OnRig {
     /// The result of the ticks so far.
     fn acquired(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span], board: &str) -> Acquired {
         let rows = self.rows(ticks);
-        let records = spans
-            .iter()
-            .filter_map(|span| rows.segment(span, plan.lost_frames).ok())
-            .collect();
+        let (mut records, mut out_of_view) = (Vec::new(), Vec::new());
+        for span in spans {
+            match rows.segment(span, plan.lost_frames) {
+                Ok(record) => records.push(record),
+                Err(spoilt) if spoilt.is_out_of_view() => out_of_view.push(span.index),
+                Err(_) => {}
+            }
+        }
         Acquired {
             records,
             neutral_um: ticks
@@ -350,6 +356,7 @@ impl OnRig {
             frame_age_s: rows.frame_age_s(),
             rows: (rows.input, rows.output),
             unseen: rows.unseen,
+            out_of_view,
             trouble: None,
             run: None,
             board: board.to_owned(),

@@ -54,6 +54,8 @@ pub(crate) struct Rows {
     late: Vec<bool>,
     /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
+    /// The frame came in time and showed no reliable bead.
+    without_bead: Vec<bool>,
     /// Age that each row's frame has if its command is on time, ns; `None` if it was not.
     ages_ns: Vec<Option<i64>>,
     /// Usual age of a frame at its tick, in rows.
@@ -166,6 +168,7 @@ impl Rows {
             skipped: Vec::new(),
             late: Vec::new(),
             unseen: Vec::new(),
+            without_bead: Vec::new(),
             ages_ns: Vec::new(),
             usual_age_periods: 0.0,
             of_tick: Vec::new(),
@@ -207,6 +210,7 @@ impl Rows {
                 rows.skipped.push(true);
                 rows.late.push(true);
                 rows.unseen.push(false);
+                rows.without_bead.push(false);
                 rows.ages_ns.push(None);
                 late_periods.push(0.0);
             }
@@ -228,6 +232,7 @@ impl Rows {
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
+            rows.without_bead[row] = is_unseen(tick);
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
             rows.usable[row] = tick.is_controlled();
             // If a tick was skipped or its record was lost, the next tick takes its place.
@@ -261,15 +266,26 @@ impl Rows {
         else {
             return Err(Spoilt::NotRun);
         };
+        // A bead out of view: most of the frames without a position came and showed none. Of a machine that stalls they did not come.
+        let out_of_view = |rows: std::ops::Range<usize>| {
+            let bare = &self.without_bead[start + rows.start..start + rows.end];
+            2 * bare.iter().filter(|bare| **bare).count() > bare.len()
+        };
         if let Some(at) = usable.iter().position(|usable| !usable) {
-            return Err(Spoilt::Frozen { at });
+            let shown = output[..at].iter().rposition(|um| um.is_finite());
+            let out_of_view = out_of_view(shown.map_or(0, |row| row + 1)..at);
+            return Err(Spoilt::Frozen { at, out_of_view });
         }
         let mut gap = 0;
         for (row, um) in output.iter().enumerate() {
             gap = if um.is_finite() { 0 } else { gap + 1 };
             if gap >= lost_frames {
                 let at = row + 1 - gap;
-                return Err(Spoilt::Unseen { at, rows: gap });
+                return Err(Spoilt::Unseen {
+                    at,
+                    rows: gap,
+                    out_of_view: out_of_view(at..row + 1),
+                });
             }
         }
         let (mut input, mut output) = (self.input[start..end].to_vec(), output.to_vec());
@@ -320,6 +336,8 @@ pub(crate) enum Spoilt {
     Frozen {
         /// First row of that.
         at: usize,
+        /// The bead had left the view.
+        out_of_view: bool,
     },
     /// No position for long.
     Unseen {
@@ -327,6 +345,8 @@ pub(crate) enum Spoilt {
         at: usize,
         /// Rows without one.
         rows: usize,
+        /// The bead had left the view.
+        out_of_view: bool,
     },
     /// Too few steps from one position to the next are left.
     Thin {
@@ -336,13 +356,27 @@ pub(crate) enum Spoilt {
 }
 
 impl Spoilt {
+    /// Whether the bead left the view: a smaller amplitude may keep it there. What the machine spoilt, none would have kept.
+    pub(crate) fn is_out_of_view(self) -> bool {
+        matches!(
+            self,
+            Self::Frozen {
+                out_of_view: true,
+                ..
+            } | Self::Unseen {
+                out_of_view: true,
+                ..
+            }
+        )
+    }
+
     /// The reason in words, for rows `period_s` apart.
     pub(crate) fn words(self, period_s: f64) -> String {
         let s = |rows: usize| rows as f64 * period_s;
         match self {
             Self::NotRun => "the run ended before it did".to_string(),
-            Self::Frozen { at } => format!("the loop was frozen after {:.2} s", s(at)),
-            Self::Unseen { at, rows } => {
+            Self::Frozen { at, .. } => format!("the loop was frozen after {:.2} s", s(at)),
+            Self::Unseen { at, rows, .. } => {
                 format!("no position for {:.2} s after {:.2} s", s(rows), s(at))
             }
             Self::Thin { lost } => format!(

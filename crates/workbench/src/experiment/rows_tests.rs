@@ -235,3 +235,60 @@ fn a_segment_that_lost_half_of_its_steps_is_measured_again_and_one_that_lost_a_t
         assert!(why.is_none_or(|why| why.starts_with("50 % of its frames")));
     }
 }
+
+#[test]
+fn a_stall_is_no_reason_to_move_the_bead_less_and_a_bead_out_of_view_is() {
+    let calm = Lateness {
+        most_ns: 0.0,
+        often_ns: 0.0,
+        skipped: 0.0,
+        drift: 0.0,
+    };
+    let span = Span {
+        index: 0,
+        start: 0,
+        settle: 100,
+        rows: 800,
+    };
+    let spoilt = |change: &dyn Fn(&mut Vec<TickRecord>)| {
+        let mut ticks = ticks(10.0, 2000, &calm);
+        change(&mut ticks);
+        let spoilt = Rows::of(&ticks, PERIOD_NS).segment(&span, 50).unwrap_err();
+        println!("{spoilt:?}");
+        spoilt.is_out_of_view()
+    };
+    let gone = 600..680;
+    assert!(spoilt(&|ticks| {
+        for tick in &mut ticks[gone.clone()] {
+            tick.measured_um = f64::NAN;
+        }
+    }));
+    let frozen = |ticks: &mut Vec<TickRecord>| {
+        for tick in &mut ticks[gone.end..gone.end + 20] {
+            tick.flags.set(TickFlags::FREEZE);
+        }
+    };
+    assert!(spoilt(&|ticks| {
+        for tick in &mut ticks[gone.end - 20..gone.end] {
+            tick.measured_um = f64::NAN;
+        }
+        frozen(ticks);
+    }));
+    assert!(!spoilt(&frozen), "an operator froze it");
+    // A timer replaces the camera while it stalls.
+    let stalled = |ticks: &mut Vec<TickRecord>| {
+        for tick in &mut ticks[gone.clone()] {
+            tick.flags.set(TickFlags::TIMER);
+            tick.verdict = 255;
+            tick.measured_um = f64::NAN;
+        }
+    };
+    assert!(!spoilt(&stalled));
+    assert!(!spoilt(&|ticks| {
+        ticks.drain(gone.clone());
+    }));
+    assert!(!spoilt(&|ticks| {
+        stalled(ticks);
+        frozen(ticks);
+    }));
+}

@@ -61,6 +61,7 @@ fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it
         .expect("a run");
     let indices: Vec<usize> = acquired.records.iter().map(|record| record.index).collect();
     assert_eq!(indices, [1], "the first is spoilt, the second is whole");
+    assert_eq!(acquired.out_of_view, [0]);
     let told = acquired.trouble.as_ref().map(ToString::to_string);
     let told = told.unwrap_or_default();
     let begins = "1 of 2 segments were spoilt; segment 1 (60 Hz): the loop was frozen after 0.";

@@ -280,22 +280,22 @@ fn on_rig(
         board = Some(acquired.board);
         runs.extend(acquired.run.clone());
         had_bead |= !acquired.rows.0.is_empty();
-        let run_through = matches!(acquired.trouble, Some(Trouble::Spoilt { .. }));
         let failed = missing(plan, &records, &spoilt);
         let done = todo.iter().filter(|turn| turn.part < 1.0);
         let done = done.filter(|turn| failed.iter().all(|f| f.index != turn.index));
         warnings.extend(done.map(|turn| {
             format!(
-                "segment {} ({}) could not be measured twice as planned and is measured at {} of its amplitude",
+                "segment {} ({}) lost the bead twice as planned and is measured at {} of its amplitude",
                 turn.index + 1,
                 plan.segments[turn.index].label,
                 turn.part
             )
         }));
-        // A run that ended early has not tried the later segments.
-        let tried = if run_through { failed.len() } else { 1 };
-        for turn in failed.iter().take(tried) {
-            spoilt[turn.index] += 1;
+        // Of a run that a lost bead ended, the first missing segment lost it.
+        let lost = matches!(&acquired.trouble, Some(Trouble::Ended(ended)) if !ended.may_pass());
+        for (place, turn) in failed.iter().enumerate() {
+            let out_of_view = acquired.out_of_view.contains(&turn.index);
+            spoilt[turn.index] += u32::from(out_of_view || lost && place == 0);
         }
         match acquired.trouble {
             None => {}
@@ -343,8 +343,9 @@ fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
     ended.may_pass() || had_bead && lost
 }
 
-/// Segments not measured yet. After a first failure, which may be a stall, a segment runs again as planned. If it fails again,
-/// the rig moves the bead further than the model predicts: it runs at half the amplitude, then at a quarter.
+/// Segments not measured yet, each with the times that the bead left the view in it, `spoilt`. After the first, which may be chance, it
+/// runs again as planned. After another one the rig moves the bead further than the model predicts: half the amplitude, then a quarter.
+/// What the machine spoilt runs again as it was.
 fn missing(plan: &Plan, records: &[RecordedSegment], spoilt: &[u32]) -> Vec<Turn> {
     let is_missing = |index: &usize| records.iter().all(|r| r.index != *index);
     let indices = (0..plan.segments.len()).filter(is_missing);
