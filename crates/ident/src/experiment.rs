@@ -10,10 +10,12 @@ use crate::excitation::{ExcitationLimits, Signal, Tone, fold, shaped_amplitude_u
 use crate::frequency_response::{
     DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure, scatter_of_rest,
 };
-use crate::noise::{NoiseModel, apply_noise_model};
+use crate::noise::apply_noise_model;
 use crate::rest::{Rest, plant_of};
 use crate::sampled::Sampling;
-pub use crate::segments::{RecordedSegment, Schedule, Span, common_age_s};
+pub use crate::segments::{
+    Cause, Measured, RecordedSegment, Schedule, Span, Stopped, common_age_s,
+};
 use cellpos_numeric::Random;
 use serde::{Deserialize, Serialize};
 
@@ -483,35 +485,6 @@ fn rows(seconds: f64, period_s: f64) -> usize {
 /// Share of the excitation in row `k` of `release` rows of fading out.
 fn fade_out(k: usize, release: usize) -> f64 {
     0.5 + 0.5 * (std::f64::consts::PI * (k + 1) as f64 / release as f64).cos()
-}
-
-/// The finished segments of a run that ended early, and the cause.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Stopped<E> {
-    /// Segments finished before.
-    pub done: Vec<RecordedSegment>,
-    /// What happened.
-    pub cause: Cause<E>,
-}
-
-/// The cause of an early end.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Cause<E> {
-    /// The rig failed.
-    Rig(E),
-    /// [`IdentError::BeadLost`]; resume at the segment that it names.
-    BeadLost(IdentError),
-}
-
-/// A measured frequency response.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Measured {
-    /// Driven lines in order of frequency.
-    pub points: Vec<FrequencyPoint>,
-    /// The noise model, if there were enough lines.
-    pub noise: Option<NoiseModel>,
-    /// Per segment, detection lines included.
-    pub segments: Vec<SegmentResponse>,
 }
 
 #[cfg(test)]

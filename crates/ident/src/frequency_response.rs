@@ -305,7 +305,8 @@ pub(crate) fn scatter_of_rest(
         let sum: f64 = point.block_errors.iter().map(|e| e.norm_sqr()).sum();
         point.scatter_variance = sum / (count * (count - 1.0));
         point.variance = point.scatter_variance;
-        point.variance_dof = 2.0 * (count - 1.0);
+        let freedom: f64 = blocks.iter().map(|block| block.freedom[i]).sum();
+        point.variance_dof = freedom * (count - 1.0) / count;
         let spread: f64 = blocks.iter().map(|block| block.spread[i]).sum();
         point.spread = spread / (count * count * point.input.norm_sqr());
     }

@@ -1,4 +1,8 @@
-//! The segments of an experiment: their ticks in the schedule, and their records.
+//! The segments of an experiment: their ticks in the schedule, their records, and what a run or an analysis of them gives.
+
+use crate::error::IdentError;
+use crate::frequency_response::{FrequencyPoint, SegmentResponse};
+use crate::noise::NoiseModel;
 
 /// Segments laid end to end.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,4 +50,33 @@ pub struct RecordedSegment {
     pub input: Vec<f64>,
     /// Bead position per row, um; `NaN` in a row without one.
     pub output: Vec<f64>,
+}
+
+/// The finished segments of a run that ended early, and the cause.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stopped<E> {
+    /// Segments finished before.
+    pub done: Vec<RecordedSegment>,
+    /// What happened.
+    pub cause: Cause<E>,
+}
+
+/// The cause of an early end.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Cause<E> {
+    /// The rig failed.
+    Rig(E),
+    /// [`IdentError::BeadLost`]; resume at the segment that it names.
+    BeadLost(IdentError),
+}
+
+/// A measured frequency response.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Measured {
+    /// Driven lines in order of frequency.
+    pub points: Vec<FrequencyPoint>,
+    /// The noise model, if there were enough lines.
+    pub noise: Option<NoiseModel>,
+    /// Per segment, detection lines included.
+    pub segments: Vec<SegmentResponse>,
 }

@@ -44,6 +44,8 @@ pub struct BlockPhasors {
     /// Variance of each phasor, `E|error|^2`, for white rows (levels or increments) of variance 1. A block of few periods does not part a
     /// sine from drift and from the other sines, so it is more than `4 / rows`.
     pub spread: Vec<f64>,
+    /// Degrees of freedom of `|error|^2` of each phasor: 2 if both quadratures are as uncertain, nearly 1 if drift hides one.
+    pub freedom: Vec<f64>,
     /// Residual variance per real row (levels or increments), unit^2.
     pub residual_variance: f64,
     /// Rows that took part.
@@ -120,11 +122,7 @@ pub fn fit_block(
     if rows < columns + 2 {
         return None;
     }
-    for i in 0..columns {
-        for j in 0..i {
-            normal[(j, i)] = normal[(i, j)];
-        }
-    }
+    normal.fill_upper_triangle_with_lower_triangle();
     let diagonal_floor = 1e-9 * rows as f64;
     let factor = normal.cholesky()?;
     if (0..columns).any(|i| factor.l_dirty()[(i, i)].powi(2) < diagonal_floor * 1e-3) {
@@ -132,14 +130,7 @@ pub fn fit_block(
     }
     let solved = factor.solve(&right);
     let explained = solved.dot(&right);
-    let inverse = factor.inverse();
-    let power = |angle: f64| match increments {
-        true => (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr(),
-        false => 1.0,
-    };
-    let spread = angles.iter().enumerate().map(|(i, &angle)| {
-        (inverse[(2 * i, 2 * i)] + inverse[(2 * i + 1, 2 * i + 1)]) / power(angle)
-    });
+    let (spread, freedom) = certainty(&factor.inverse(), &angles, increments);
     let phasors = angles
         .iter()
         .enumerate()
@@ -154,11 +145,27 @@ pub fn fit_block(
         .collect();
     Some(BlockPhasors {
         phasors,
-        spread: spread.collect(),
+        spread,
+        freedom,
         drift: solved.iter().skip(2 * angles.len()).copied().collect(),
         residual_variance: ((sum_squares - explained) / (rows - columns) as f64).max(0.0),
         rows,
     })
+}
+
+/// [`BlockPhasors::spread`] and [`BlockPhasors::freedom`] from the inverse of the normal matrix.
+fn certainty(inverse: &DMatrix<f64>, angles: &[f64], increments: bool) -> (Vec<f64>, Vec<f64>) {
+    let of = |(i, &angle): (usize, &f64)| {
+        let at = |row: usize, column: usize| inverse[(2 * i + row, 2 * i + column)];
+        let both = at(0, 0) + at(1, 1);
+        let squares = at(0, 0).powi(2) + at(1, 1).powi(2) + 2.0 * at(0, 1).powi(2);
+        let power = match increments {
+            true => (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr(),
+            false => 1.0,
+        };
+        (both / power, both * both / squares)
+    };
+    angles.iter().enumerate().map(of).unzip()
 }
 
 /// Cuts `rows` into at most `most` blocks. Each holds a whole number of periods of `frequency_hz`, as nearly as rows allow, and at least
