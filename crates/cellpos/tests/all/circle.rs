@@ -214,26 +214,37 @@ fn a_run_of_track_is_data_wherever_its_bead_rested() {
     assert!((augmented.working_point_um - 20.0).abs() < 0.05);
 }
 
-/// An ordinary run in closed loop of a rig whose bead moves by less than its model says: it shows by how much, and nothing beside it.
+/// Ordinary runs in closed loop of a rig whose bead moves by less than its model says: each shows by how much, and nothing beside it.
 #[test]
-fn a_sine_of_track_shows_what_its_rig_hides() {
+fn a_sine_of_track_and_a_script_each_show_what_their_rig_hides() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     hide(at, "hidden.toml", effects::gain_error(0.8));
     std::fs::write(at.join("rig.toml"), "[emulator]\nmodel = \"hidden.toml\"\n").unwrap();
-    let line = "track --target 0um --controller pi --sine 3um@10Hz --duration 10s --rig rig.toml --clock virtual --frames off --seed 4 --json";
-    let run = succeed(at, line).json()["run"].as_str().unwrap().to_owned();
-    let line = format!("reconcile --model eq6 --data {run} --max-effects 2 --json");
-    let r = succeed(at, &line).json();
-    let factor = &named(&r, "gain-error")["parameters"]["factor"];
-    let ci95 = |i: usize| factor["ci95"][i].as_f64().unwrap();
-    assert!(ci95(0) <= 0.8 && 0.8 <= ci95(1), "{factor}");
-    assert!(ci95(1) - ci95(0) < 0.08, "{factor}");
-    let ids: Vec<&str> = (r["effects"].as_array().unwrap().iter())
-        .map(|e| e["id"].as_str().unwrap())
-        .collect();
-    let expected = |id: &&str| ["gain-error", "time-delay"].contains(id);
-    assert!(ids.iter().all(expected), "{ids:?}");
+    let script = "name = \"tire\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 120\n\
+                  [[step]]\ndo = \"sine\"\namplitude = \"3um\"\nfrequency = \"4Hz\"\ncycles = 24\n\
+                  [[step]]\ndo = \"hold\"\nduration = \"4s\"\n";
+    std::fs::write(at.join("tire.toml"), script).unwrap();
+    let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 10s";
+    for (line, seed) in [(track, 4), ("run tire.toml", 5)] {
+        let line =
+            format!("{line} --rig rig.toml --clock virtual --frames off --seed {seed} --json");
+        let run = succeed(at, &line).json()["run"]
+            .as_str()
+            .unwrap()
+            .to_owned();
+        let line = format!("reconcile --model eq6 --data {run} --max-effects 2 --json");
+        let r = succeed(at, &line).json();
+        let factor = &named(&r, "gain-error")["parameters"]["factor"];
+        let ci95 = |i: usize| factor["ci95"][i].as_f64().unwrap();
+        assert!(ci95(0) <= 0.8 && 0.8 <= ci95(1), "{line}: {factor}");
+        assert!(ci95(1) - ci95(0) < 0.08, "{line}: {factor}");
+        let ids: Vec<&str> = (r["effects"].as_array().unwrap().iter())
+            .map(|e| e["id"].as_str().unwrap())
+            .collect();
+        let expected = |id: &&str| ["gain-error", "time-delay"].contains(id);
+        assert!(ids.iter().all(expected), "{line}: {ids:?}");
+    }
 }
 
 #[test]

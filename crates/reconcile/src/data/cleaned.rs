@@ -57,3 +57,34 @@ pub(super) fn without_lines(e: &[f64], present: &[bool], sample_s: f64) -> (Vec<
     }
     (clean, fitted)
 }
+
+/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
+pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
+    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
+    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
+    for k in 1..r.len() {
+        if valid(k) {
+            mean += r[k] - r[k - 1];
+            n0 += 1;
+        }
+    }
+    if n0 == 0 {
+        return (0.0, 0.0, 0);
+    }
+    mean /= n0 as f64;
+    for k in 1..r.len() {
+        if valid(k) {
+            let d = r[k] - r[k - 1] - mean;
+            c0 += d * d;
+            if valid(k - 1) {
+                c1 += d * (r[k - 1] - r[k - 2] - mean);
+                n1 += 1;
+            }
+        }
+    }
+    (
+        c0 / n0 as f64,
+        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
+        n0,
+    )
+}

@@ -228,7 +228,7 @@ mod tests {
 
     fn chosen(values: &[f64], kind: NoiseKind) -> NoiseModel {
         let counts = vec![true; values.len()];
-        let (c0, c1, _) = crate::data::floor::increment_moments(values, &counts);
+        let (c0, c1, _) = crate::data::cleaned::increment_moments(values, &counts);
         let alone = Alone {
             values,
             counts: &counts,

@@ -1,8 +1,9 @@
 //! The noise floor, from the records or from what is stated, before any model is believed; or the statement that it is not
 //! known.
 
-use crate::data::cleaned::{without_jumps, without_lines};
+use crate::data::cleaned::{increment_moments, without_jumps, without_lines};
 use crate::data::coloured::{Alone, NoiseKind, choose};
+use crate::data::no_response::{holds, without_response};
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
 use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
@@ -115,8 +116,9 @@ pub(crate) fn error_of(rows: usize) -> f64 {
 /// A rest record shows the noise itself (lines at the mains frequency and a drift removed). If the command of a record repeats,
 /// the difference of successive periods cancels every response that repeats; so does the difference of two records of the same
 /// command. The surely smallest estimate rules, with those that differ from it by chance: a misfit can only add, and the smallest
-/// of several uncertain ones is too small. Without any estimate the model's noise is taken, unless the records are below it.
-/// Without that the floor is not known, and the increments of the residuals replace it in the figures alone.
+/// of several uncertain ones is too small. A bead held in closed loop shows the noise by what does not follow the command. Without
+/// any estimate the model's noise is taken, unless the records are below it. Without that the floor is not known, and the increments
+/// of the residuals replace it in the figures alone.
 pub(crate) fn estimate(
     records: &[Record],
     present: &[Vec<bool>],
@@ -125,27 +127,17 @@ pub(crate) fn estimate(
     kind: NoiseKind,
 ) -> Floor {
     let mut found = of_records(records, present, residuals);
-    let own: Vec<Estimate> = (residuals.iter().zip(present))
-        .map(|(e, present)| {
-            let (c0, c1, rows) = increment_moments(e, present);
-            Estimate {
-                c0,
-                c1,
-                rows,
-                independent: 1.0,
-                source: FloorSource::Unknown,
-                alone: (e.clone(), present.clone()),
-                share: 1.0,
-            }
-        })
-        .collect();
     let quantum_um2 = quantisation_um2(records);
+    let walks = kind == NoiseKind::Walk && quantum_um2 == 0.0;
     // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
     let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
     let kind = if unasked { NoiseKind::Walk } else { kind };
     // If no whole record shows the noise, parts of records may: a misfit can only add.
     if found.is_empty() {
         found = of_parts(records, present, residuals);
+    }
+    if found.is_empty() && walks {
+        found = of_holds(records, present, residuals);
     }
     if let Some(least) = found.iter().min_by(|a, b| a.most().total_cmp(&b.most())) {
         let pooled = pooled(&found, least);
@@ -157,7 +149,8 @@ pub(crate) fn estimate(
             rows: pooled.rows,
         };
     }
-    let own: Vec<Estimate> = (own.into_iter())
+    let own: Vec<Estimate> = (residuals.iter().zip(present))
+        .map(|(e, present)| of_increments(e, present))
         .filter(|f| f.rows >= 20 && f.c0 > 0.0)
         .collect();
     let residual = own
@@ -171,24 +164,25 @@ pub(crate) fn estimate(
             choose(kind, walk, &least.alone()).at_least(quantum_um2)
         });
     let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
-    match (stated, residual) {
-        (Some(noise), Some(least))
-            if noise.innovation_um() < (1.0 + THRESHOLDS.stated_excess) * least.innovation_um() =>
-        {
-            Floor {
-                noise: NoiseModel {
-                    white_um2: noise.white_um2.max(quantum_um2),
-                    ..noise
-                },
-                source: FloorSource::Stated,
-                rows: 0,
-            }
-        }
-        (_, least) => Floor {
-            noise: least.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
-            source: FloorSource::Unknown,
+    let above = |noise: &NoiseModel, least: NoiseModel| {
+        noise.innovation_um() >= (1.0 + THRESHOLDS.stated_excess) * least.innovation_um()
+    };
+    if let (Some(noise), Some(least)) = (stated, residual)
+        && !above(&noise, least)
+    {
+        return Floor {
+            noise: NoiseModel {
+                white_um2: noise.white_um2.max(quantum_um2),
+                ..noise
+            },
+            source: FloorSource::Stated,
             rows: 0,
-        },
+        };
+    }
+    Floor {
+        noise: residual.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
+        source: FloorSource::Unknown,
+        rows: 0,
     }
 }
 
@@ -312,6 +306,44 @@ fn between_periods(r: &Record, e: &[f64], present: &[bool], repeats: &Repeats) -
         .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
 }
 
+/// The increments of residuals as they are.
+fn of_increments(e: &[f64], present: &[bool]) -> Estimate {
+    let (c0, c1, rows) = increment_moments(e, present);
+    Estimate {
+        c0,
+        c1,
+        rows,
+        independent: 1.0,
+        source: FloorSource::Unknown,
+        alone: (e.to_vec(), present.to_vec()),
+        share: 1.0,
+    }
+}
+
+/// Holds of a bead in closed loop: stretches in which the command moves the bead by less than the noise does. What follows the command
+/// linearly is taken off.
+fn of_holds(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
+    /// Rounds in which noise and response settle: each leaves a part of the last one's error that is as small as the response's share.
+    const ROUNDS: usize = 3;
+    let mut found: Vec<Estimate> = Vec::new();
+    for ((r, e), ok) in records.iter().zip(residuals).zip(present) {
+        for rows in holds(r, e, ok) {
+            let (u, e, ok) = (&r.pzt_um[rows.clone()], &e[rows.clone()], &ok[rows]);
+            let mut own = of_increments(e, ok);
+            for _ in 0..ROUNDS {
+                let noise = NoiseModel::from_increments(own.c0, own.c1);
+                let Some((clean, fitted)) = without_response(u, e, ok, &noise) else {
+                    break;
+                };
+                let share = own.rows as f64 / (own.rows as f64 - fitted as f64).max(1.0);
+                own = of(&clean, ok, r.sample_s, FloorSource::Rest, share);
+            }
+            found.extend((own.source == FloorSource::Rest && own.counts()).then_some(own));
+        }
+    }
+    found
+}
+
 /// Those that differ from the least by chance together.
 fn pooled(of: &[Estimate], least: &Estimate) -> Estimate {
     let by_chance = |f: &&Estimate| {
@@ -369,37 +401,6 @@ pub(crate) fn refined(noise: &NoiseModel, unlikelihood: impl Fn(&NoiseModel) -> 
     let share = ((noise.white_um2 / variance - LEAST) / RANGE).clamp(1e-3, 1.0 - 1e-3);
     let begun = [variance.ln(), (share / (1.0 - share)).ln()];
     of(descend(begun, 2e-3, |x| unlikelihood(&of(x))))
-}
-
-/// Variance and lag-1 covariance of increments over runs of present frames, and how many increments.
-pub(crate) fn increment_moments(r: &[f64], present: &[bool]) -> (f64, f64, usize) {
-    let (mut c0, mut c1, mut n0, mut n1, mut mean) = (0.0, 0.0, 0usize, 0usize, 0.0);
-    let valid = |k: usize| k >= 1 && present[k] && present[k - 1];
-    for k in 1..r.len() {
-        if valid(k) {
-            mean += r[k] - r[k - 1];
-            n0 += 1;
-        }
-    }
-    if n0 == 0 {
-        return (0.0, 0.0, 0);
-    }
-    mean /= n0 as f64;
-    for k in 1..r.len() {
-        if valid(k) {
-            let d = r[k] - r[k - 1] - mean;
-            c0 += d * d;
-            if valid(k - 1) {
-                c1 += d * (r[k - 1] - r[k - 2] - mean);
-                n1 += 1;
-            }
-        }
-    }
-    (
-        c0 / n0 as f64,
-        if n1 > 0 { c1 / n1 as f64 } else { 0.0 },
-        n0,
-    )
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ pub(crate) mod flow_estimate;
 pub(crate) mod frames;
 pub(crate) mod free;
 pub(crate) mod motion;
+pub(crate) mod no_response;
 pub(crate) mod noise;
 pub(crate) mod record;
 pub(crate) mod repeats;

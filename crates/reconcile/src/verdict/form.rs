@@ -10,7 +10,7 @@ use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Columns;
-use crate::search::cost::{left_over, prior_penalty};
+use crate::search::cost::{left_over, penalised_cost, prior_penalty};
 use crate::search::sequential::Found;
 use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
@@ -62,6 +62,14 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         }) else {
             break;
         };
+        // What is small is a form of the others.
+        let is_large = worth[i] >= THRESHOLDS.companion_share;
+        if is_large && let Some(fit) = in_its_stead(ctx, found, i, &without[i]) {
+            found.fit = fit;
+            let taken = found.fit.parts[i].id();
+            found.rivals[i].retain(|r| r.id != taken);
+            continue;
+        }
         aside
             .companions
             .push((found.fit.parts[i].id().to_owned(), worth[i].min(1.0)));
@@ -73,6 +81,25 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         }
     }
     aside
+}
+
+/// The set with a rival in place of a hysteresis without memory: one that explains as much as a static curve does. A gain is such a
+/// curve.
+fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize, without: &Fit) -> Option<Fit> {
+    found.fit.parts[i].variant.memoryless()?;
+    let least = THRESHOLDS.curve_share * (without.chi2 - found.fit.chi2);
+    let rivals = found.rivals.get(i)?.iter();
+    let mut fits: Vec<Fit> = rivals
+        .filter(|r| !r.is_limit && r.part.variant.memoryless().is_none())
+        .map(|r| {
+            let mut parts = found.fit.parts.clone();
+            parts[i] = r.part.clone();
+            ctx.fit_from(parts, Some(found.fit.soft), &ctx.problem.all(), ROUNDS)
+        })
+        .filter(|fit| without.chi2 - fit.chi2 > least)
+        .collect();
+    fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
+    fits.into_iter().next()
 }
 
 /// Reduces a set to one effect if that effect alone, in a freer form, explains as much as the set. Within such a set no effect is

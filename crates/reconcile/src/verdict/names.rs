@@ -121,12 +121,18 @@ pub(crate) fn names(
         let gain = (without.chi2 - fit.chi2).max(0.0);
         out.curvature |= mostly_curvature(ctx, fit, i, gain)
             || form::remembers_nothing(ctx, part, &without, gain);
-        let rivals = rivals.get(i).map_or(&[][..], Vec::as_slice);
-        let (alternatives, open) = alternatives(ctx, fit, i, rivals);
+        // A hysteresis that remembers nothing is the curve that it is, and no rival of another.
+        let remembers =
+            |r: &&Rival| !form::remembers_nothing(ctx, &r.part, &without, without.chi2 - r.chi2);
+        let rivals: Vec<Rival> = (rivals.get(i).into_iter().flatten())
+            .filter(remembers)
+            .cloned()
+            .collect();
+        let (alternatives, open) = alternatives(ctx, fit, i, &rivals);
         out.ambiguous |= open;
         let mut parameters = parameters(ctx, fit, i, &sure);
         // Other valleys of the same equation that fit as well.
-        for r in rivals {
+        for r in &rivals {
             if r.part.variant == part.variant && r.chi2 - fit.chi2 < SURE * SURE {
                 for (p, value) in part.variant().params.iter().zip(r.part.natural()) {
                     if let Some(found) = parameters.get_mut(p.name) {
