@@ -83,7 +83,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             .transpose()?;
         Ok(Self {
             estimator: Estimator::new(config, model)?,
-            path: Path::new(&model, &parts.limits),
+            path: Path::new(&model, &parts.limits)?,
             adapter,
             parts,
         })

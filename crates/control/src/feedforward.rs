@@ -6,6 +6,7 @@
 //! must never be inverted.)
 
 use crate::deviation::{DEVIATION, Deviation};
+use crate::error::{BuildError, check};
 use crate::limits::Limits;
 use crate::loop_model::{LoopModel, MODES};
 use crate::riccati::lq_feedback;
@@ -79,6 +80,8 @@ impl Reach {
 pub(crate) const BRAKING_TICKS: usize = 24;
 /// Displacement by which a move may end beyond what is wanted, um: 10 nm of bead in a tick.
 const OVERRUN_UM: f64 = 0.025;
+/// Motion in a sample below which its inverse is rounding, um for 1 um of command.
+const LEAST_MOTION_UM: f64 = 1e-12;
 /// Halvings of the interval in which the largest displacement is looked for: a thousandth of the range.
 const HALVINGS: usize = 12;
 
@@ -96,10 +99,20 @@ pub(crate) struct FeedForward {
 }
 
 impl FeedForward {
-    pub(crate) fn new(model: &LoopModel) -> Self {
+    /// # Errors
+    /// [`BuildError`] where a command moves the bead by so little in a sample that its inverse is rounding.
+    pub(crate) fn new(model: &LoopModel) -> Result<Self, BuildError> {
         let d = Deviation::new(model);
+        let moved_um = d.moved_um();
+        check(
+            "motion of the bead one sample after 1 um of command",
+            "um",
+            moved_um,
+            moved_um.abs() >= LEAST_MOTION_UM,
+            "at least 1e-12 um, or no command follows a reference",
+        )?;
         let (direct, to_come) = inverse(&d);
-        Self {
+        Ok(Self {
             direct,
             to_come,
             a: std::array::from_fn(|i| d.a[(i + 1, i + 1)]),
@@ -107,7 +120,7 @@ impl FeedForward {
             c: std::array::from_fn(|i| d.c[i + 1]),
             gain: d.b[0],
             feedthrough: d.c[DEVIATION - 1],
-        }
+        })
     }
 
     /// At rest at a reference.
@@ -270,7 +283,7 @@ mod tests {
 
     #[test]
     fn the_feed_forward_command_makes_eq6_follow_any_reference() {
-        let forward = FeedForward::new(&LoopModel::eq6(2e-3));
+        let forward = FeedForward::new(&LoopModel::eq6(2e-3)).unwrap();
         let plant =
             DiscretePlant::new(&TransferFunction::eq6(), Seconds(1e-3), Seconds(0.0)).unwrap();
         let reference = |k: usize| {
@@ -308,7 +321,7 @@ mod tests {
             sample_time_s: 0.02,
             ..LoopModel::integrator(k, 2e-3)
         };
-        let forward = FeedForward::new(&model);
+        let forward = FeedForward::new(&model).unwrap();
         let mut state = FeedForward::rest(0.0);
         let mut largest: f64 = 0.0;
         for tick in 0..400 {

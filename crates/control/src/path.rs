@@ -3,6 +3,7 @@
 //! The reference is known in advance, so no law has to find the command that follows it: the loop adds that command, and the law corrects
 //! the rest. A jump that no preview announced moves the path at once and is left to the law.
 
+use crate::error::BuildError;
 use crate::exposure::Past;
 use crate::feedforward::{FeedForward, FeedForwardState, Reach};
 use crate::law::LawInput;
@@ -32,12 +33,12 @@ pub struct PathState {
 }
 
 impl Path {
-    pub(crate) fn new(model: &LoopModel, limits: &Limits) -> Self {
-        Self {
-            forward: FeedForward::new(model),
+    pub(crate) fn new(model: &LoopModel, limits: &Limits) -> Result<Self, BuildError> {
+        Ok(Self {
+            forward: FeedForward::new(model)?,
             reach: Reach::of(limits, model.sample_time_s).with_reserve(RESERVE_UM),
             feedthrough: model.feedthrough,
-        }
+        })
     }
 
     /// A tick without the law: the path is at the reference.

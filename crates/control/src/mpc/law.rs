@@ -74,7 +74,7 @@ impl MpcLaw {
         let this = Self {
             config: *config,
             condensed,
-            forward: FeedForward::new(model),
+            forward: FeedForward::new(model)?,
             pi: PiLaw::new(pi, model.sample_time_s)?,
             reach: Reach::of(limits, model.sample_time_s),
         };

@@ -161,7 +161,7 @@ impl Adapter {
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
             lines: LineSettings::new(ts, config.ticks_per_fix),
-            forward: FeedForward::new(&model),
+            forward: FeedForward::new(&model)?,
             delay_samples: model.delay_samples(),
             jump: model.feedthrough * model.gain_per_s.signum() / moves,
             sample_s: ts,

@@ -74,8 +74,10 @@ pub(super) fn without_response(
     };
     let e = white(&residual_um[..rows]);
     let whitened: Vec<Vec<f64>> = columns.iter().map(|c| white(c)).collect();
+    // A stretch shorter than the command's blocks has columns of zeros.
     let sizes: Vec<f64> = (whitened.iter())
-        .map(|w| dot(w, w).sqrt().max(f64::MIN_POSITIVE))
+        .map(|w| dot(w, w).sqrt())
+        .map(|size| if size > 0.0 { size } else { 1.0 })
         .collect();
     let n = columns.len();
     let normal = DMatrix::from_fn(n, n, |i, j| {
