@@ -164,25 +164,24 @@ pub(crate) fn estimate(
             choose(kind, walk, &least.alone()).at_least(quantum_um2)
         });
     let sample_s = records.first().map_or(1e-3, |r| r.sample_s);
-    let above = |noise: &NoiseModel, least: NoiseModel| {
-        noise.innovation_um() >= (1.0 + THRESHOLDS.stated_excess) * least.innovation_um()
-    };
-    if let (Some(noise), Some(least)) = (stated, residual)
-        && !above(&noise, least)
-    {
-        return Floor {
-            noise: NoiseModel {
-                white_um2: noise.white_um2.max(quantum_um2),
-                ..noise
-            },
-            source: FloorSource::Stated,
+    match (stated, residual) {
+        (Some(noise), Some(least))
+            if noise.innovation_um() < (1.0 + THRESHOLDS.stated_excess) * least.innovation_um() =>
+        {
+            Floor {
+                noise: NoiseModel {
+                    white_um2: noise.white_um2.max(quantum_um2),
+                    ..noise
+                },
+                source: FloorSource::Stated,
+                rows: 0,
+            }
+        }
+        (_, least) => Floor {
+            noise: least.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
+            source: FloorSource::Unknown,
             rows: 0,
-        };
-    }
-    Floor {
-        noise: residual.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
-        source: FloorSource::Unknown,
-        rows: 0,
+        },
     }
 }
 

@@ -30,8 +30,8 @@ fn blocks() -> Vec<(usize, usize)> {
     blocks
 }
 
-/// A residual without what follows the command linearly, and how many numbers were fitted for that; `None` of a record too short.
-/// Before the record the command rested where it begins.
+/// A residual without what follows the command linearly, and how many numbers were fitted for that. `None` of a record too short, or with
+/// values that are no numbers. Before the record the command rested where it begins.
 pub(super) fn without_response(
     command_um: &[f64],
     residual_um: &[f64],
@@ -84,6 +84,9 @@ pub(super) fn without_response(
         dot(&whitened[i], &whitened[j]) / (sizes[i] * sizes[j])
     });
     let right = DVector::from_fn(n, |i, _| dot(&whitened[i], &e) / sizes[i]);
+    if !normal.iter().chain(&right).all(|x| x.is_finite()) {
+        return None;
+    }
     // A command of few lines leaves combinations of the columns open: they are no numbers of the fit.
     const OPEN: f64 = 1e-10;
     let svd = normal.svd(true, true);
@@ -131,8 +134,8 @@ mod tests {
     use super::*;
     use cellpos_numeric::Random;
 
-    /// A bead in a loop whose command follows from each frame and acts three rows later, with a gain that the model does not have: the residual beside a model of
-    /// gain 0.4 a row.
+    /// A bead in a loop whose command follows from each frame and acts three rows later, with a gain that the model does not have: the
+    /// residual beside a model of gain 0.4 a row.
     fn closed(rows: usize, gain: f64, seed: u64) -> (Vec<f64>, Vec<f64>) {
         let mut random = Random::new(seed);
         let (mut x, mut model) = (0.0, 0.0);
@@ -162,5 +165,20 @@ mod tests {
             // 16,000 squares scatter by 1.1 %.
             assert!((found - 1.0).abs() < 0.035, "{gain} {seed}: {found}");
         }
+    }
+
+    #[test]
+    fn a_hold_that_is_shorter_than_the_command_is_looked_back_upon_has_its_noise() {
+        let (u, e) = closed(800, 0.3, 5);
+        let noise = NoiseModel::new(0.33, 1e-3, 0.002);
+        let (clean, fitted) = without_response(&u, &e, &[true; 800], &noise).unwrap();
+        let squares: f64 = clean.windows(2).map(|w| (w[1] - w[0]).powi(2)).sum();
+        let found = squares / (800 - fitted) as f64 / (0.026f64.powi(2) + 2.0 * 0.002f64.powi(2));
+        // 800 squares scatter by 5 %.
+        assert!((found - 1.0).abs() < 0.15, "{found}");
+        // A value that is no number ends it, too.
+        let mut e = e;
+        e[400] = f64::NAN;
+        assert!(without_response(&u, &e, &[true; 800], &noise).is_none());
     }
 }

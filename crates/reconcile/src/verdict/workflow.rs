@@ -208,7 +208,7 @@ fn companions(
     (confirmed(ctx, found, effort.threads, progress), aside)
 }
 
-/// Takes back what does not help where it was not fitted: it is not named. In its stead stands the best of its rivals that does.
+/// Takes back what does not help where it was not fitted: it is not named.
 fn confirmed(
     ctx: &Context<'_>,
     found: &mut Found,
@@ -217,18 +217,10 @@ fn confirmed(
 ) -> HeldOut {
     let mut held = held_out::check(ctx, &found.fit, threads);
     while let Some(i) = held.unconfirmed.first().copied() {
-        let id = ids(&found.fit)[i];
-        if let Some((fit, checked)) = confirmed_rival(ctx, found, i, threads) {
-            let instead = ids(&fit)[i];
-            progress(&format!(
-                "{id} does not hold on held-out data: {instead} in its stead does"
-            ));
-            found.rivals[i].retain(|r| r.id != instead);
-            found.fit = fit;
-            held = checked;
-            continue;
-        }
-        progress(&format!("{id} does not hold on held-out data: taken back"));
+        progress(&format!(
+            "{} does not hold on held-out data: taken back",
+            ids(&found.fit)[i]
+        ));
         let mut parts = found.fit.parts.clone();
         parts.remove(i);
         if i < found.rivals.len() {
@@ -238,29 +230,6 @@ fn confirmed(
         held = held_out::check(ctx, &found.fit, threads);
     }
     held
-}
-
-/// The set with the best rival of a part in its stead that held-out data confirm, and that check.
-fn confirmed_rival(
-    ctx: &Context<'_>,
-    found: &Found,
-    i: usize,
-    threads: usize,
-) -> Option<(Fit, HeldOut)> {
-    let mut rivals: Vec<_> = found
-        .rivals
-        .get(i)?
-        .iter()
-        .filter(|r| !r.is_limit)
-        .collect();
-    rivals.sort_by(|a, b| a.chi2.total_cmp(&b.chi2));
-    rivals.iter().find_map(|rival| {
-        let mut parts = found.fit.parts.clone();
-        parts[i] = rival.part.clone();
-        let fit = ctx.fit(parts, &ctx.problem.all(), 12);
-        let held = held_out::check(ctx, &fit, threads);
-        (!held.unconfirmed.contains(&i)).then_some((fit, held))
-    })
 }
 
 /// The problem with a zero flow as large as the commands, of a plant that integrates: slow motion then says nothing of the response.
