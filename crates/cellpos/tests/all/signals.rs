@@ -11,9 +11,18 @@ use std::time::{Duration, Instant};
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn start(folder: &Path, line: &str) -> Child {
-    Command::new(env!("CARGO_BIN_EXE_cellpos"))
+    start_with(folder, line, "--default-signal=HUP")
+}
+
+/// Signals are as they are in a terminal, but for HUP as said: the tests themselves may run in the background or under `nohup`, where they
+/// are ignored.
+fn start_with(folder: &Path, line: &str, hang_up: &str) -> Child {
+    Command::new("env")
+        .args(["--default-signal=INT,QUIT", hang_up])
+        .arg(env!("CARGO_BIN_EXE_cellpos"))
         .args(line.split_whitespace())
         .current_dir(folder)
+        .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
@@ -107,17 +116,9 @@ fn usr1_pauses_and_goes_on_and_ctrl_z_does_not_stop_a_program_that_holds_a_bead(
 fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
     for ignored in [true, false] {
         let folder = tempfile::tempdir().unwrap();
-        // Said in both cases: the tests themselves may run under `nohup`.
         let hang_up = if ignored { "ignore" } else { "default" };
-        let mut child = Command::new("env")
-            .arg(format!("--{hang_up}-signal=HUP"))
-            .arg(env!("CARGO_BIN_EXE_cellpos"))
-            .args(TRACK.split_whitespace())
-            .current_dir(folder.path())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
+        let hang_up = format!("--{hang_up}-signal=HUP");
+        let mut child = start_with(folder.path(), TRACK, &hang_up);
         running(&mut child, folder.path());
         tell(&child, Signal::HUP);
         if ignored {
@@ -301,19 +302,6 @@ fn prepared() -> tempfile::TempDir {
     folder
 }
 
-/// Started as `nohup` starts it.
-fn start_ignoring_hup(folder: &Path, line: &str) -> Child {
-    let line = format!("trap '' HUP; exec {} {line}", env!("CARGO_BIN_EXE_cellpos"));
-    Command::new("sh")
-        .args(["-c", &line])
-        .current_dir(folder)
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap()
-}
-
 /// State of a process by its letter, as the system has it.
 fn state(process: Pid) -> Option<char> {
     let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
@@ -330,7 +318,7 @@ fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop()
     } in HOLDING
     {
         let folder = prepared();
-        let mut child = start_ignoring_hup(folder.path(), line);
+        let mut child = start_with(folder.path(), line, "--ignore-signal=HUP");
         if sign.is_empty() {
             // Nothing is written until later; before the rig is held, Ctrl-Z stops the program as any other.
             let pid = Pid::from_child(&child);
