@@ -305,13 +305,6 @@ fn not_earned(ctx: &Context<'_>, e: &Evidence<'_>) -> Option<String> {
             ctx.scales.told(before)
         ));
     }
-    if e.held.after_um > e.held.before_um {
-        return Some(format!(
-            "the innovations on held-out records are {} with it and {} without",
-            ctx.scales.told(e.held.after_um),
-            ctx.scales.told(e.held.before_um)
-        ));
-    }
     if e.closure < THRESHOLDS.held_out_least {
         return Some(format!(
             "it closes {:.0} % of the gap on held-out records",

@@ -170,7 +170,17 @@ fn within(
     take_back(&ctx, &mut found, effort);
     // Without a floor, or next to a model of another rig, no small effect gets a name.
     let small = floor.source.is_known() && unlike.is_none();
-    let (held, aside) = companions(&ctx, &mut found, effort, small, progress);
+    let (mut held, aside) = companions(&ctx, &mut found, effort, small, progress);
+    // A set that predicts rows worse than no effect at all is none.
+    if held.after_um > held.before_um {
+        progress(&format!(
+            "{} predicts held-out data worse than the model alone: taken back",
+            ids(&found.fit).join(" + ")
+        ));
+        found.fit = found.null.clone();
+        found.rivals = Vec::new();
+        held = held_out::check(&ctx, &found.fit, effort.threads);
+    }
     found.fit.locking = (0..found.fit.parts.len())
         .map(|i| locking::refine(&ctx, &found.fit, i, options.threads))
         .collect();
