@@ -32,7 +32,7 @@ pub struct NoiseModel {
 }
 
 /// Power of increments at `frequency_hz`: `|1 - e^(-j 2 pi f T)|^2`.
-pub(crate) fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
+fn increment_power(frequency_hz: f64, period_s: f64) -> f64 {
     let angle = 2.0 * std::f64::consts::PI * frequency_hz * period_s;
     (1.0 - Complex::from_polar(1.0, -angle)).norm_sqr()
 }

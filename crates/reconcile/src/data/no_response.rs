@@ -4,6 +4,7 @@
 //! innovations of a residual, less their regression on the command of the last second, are those of the noise: every linear error of
 //! the model is off. A nonlinear one stays and adds to them; it takes nothing away.
 
+use crate::data::cleaned::increment_moments;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::Record;
 use crate::dot::dot;
@@ -104,21 +105,18 @@ pub(super) fn without_response(
 /// Stretches of a record in which the command moves the bead by less than the noise does, by the model.
 pub(super) fn holds(r: &Record, e: &[f64], present: &[bool]) -> Vec<Range<usize>> {
     let block = THRESHOLDS.floor_rows;
-    let variance = |step: &dyn Fn(usize) -> f64, rows: &Range<usize>| {
-        let steps: Vec<f64> = (rows.start + 1..rows.end)
-            .filter(|&k| present[k] && present[k - 1])
-            .map(step)
-            .collect();
-        let n = steps.len().max(1) as f64;
-        let mean = steps.iter().sum::<f64>() / n;
-        steps.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / n
-    };
     let mut found: Vec<Range<usize>> = Vec::new();
     for start in (0..e.len() / block).map(|i| i * block) {
         let rows = start..start + block;
-        let noise = variance(&|k| e[k] - e[k - 1], &rows);
-        let model = |k: usize| r.bead_um[k] - e[k];
-        if noise == 0.0 || variance(&|k| model(k) - model(k - 1), &rows) >= noise {
+        let of_steps = |path: &[f64]| increment_moments(path, &present[rows.clone()]).0;
+        let noise = of_steps(&e[rows.clone()]);
+        let bead = &r.bead_um[rows.clone()];
+        let model: Vec<f64> = bead
+            .iter()
+            .zip(&e[rows.clone()])
+            .map(|(y, e)| y - e)
+            .collect();
+        if noise == 0.0 || of_steps(&model) >= noise {
             continue;
         }
         match found.last_mut() {

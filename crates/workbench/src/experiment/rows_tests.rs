@@ -26,6 +26,20 @@ struct Lateness {
     drift: f64,
 }
 
+const CALM: Lateness = Lateness {
+    most_ns: 0.0,
+    often_ns: 0.0,
+    skipped: 0.0,
+    drift: 0.0,
+};
+
+const SPAN: Span = Span {
+    index: 0,
+    start: 0,
+    settle: 100,
+    rows: 800,
+};
+
 /// Numbers between 0 and 1 without a pattern, by the multiples of an irrational one.
 fn spread(k: i64, step: f64) -> f64 {
     (k as f64 * step).fract()
@@ -185,13 +199,7 @@ fn ticks_that_are_late_or_skipped_and_a_camera_that_drifts_bend_neither_gain_nor
 
 #[test]
 fn frames_that_a_stall_kept_back_are_late_and_not_dropped() {
-    let calm = Lateness {
-        most_ns: 0.0,
-        often_ns: 0.0,
-        skipped: 0.0,
-        drift: 0.0,
-    };
-    let mut ticks = ticks(10.0, 200, &calm);
+    let mut ticks = ticks(10.0, 200, &CALM);
     let (stalled, dropped) = (50..60, 120);
     // A timer replaces the camera while it stalls. Then all frames come at once.
     for tick in &mut ticks[stalled.clone()] {
@@ -212,24 +220,12 @@ fn frames_that_a_stall_kept_back_are_late_and_not_dropped() {
 
 #[test]
 fn a_segment_that_lost_half_of_its_steps_is_measured_again_and_one_that_lost_a_tenth_is_not() {
-    let calm = Lateness {
-        most_ns: 0.0,
-        often_ns: 0.0,
-        skipped: 0.0,
-        drift: 0.0,
-    };
-    let span = Span {
-        index: 0,
-        start: 0,
-        settle: 100,
-        rows: 800,
-    };
     for (every, is_whole) in [(20, true), (4, false)] {
-        let mut ticks = ticks(10.0, 2000, &calm);
+        let mut ticks = ticks(10.0, 2000, &CALM);
         for tick in ticks.iter_mut().step_by(every) {
             tick.measured_um = f64::NAN;
         }
-        let segment = Rows::of(&ticks, PERIOD_NS).segment(&span, 50);
+        let segment = Rows::of(&ticks, PERIOD_NS).segment(&SPAN, 50);
         assert_eq!(segment.is_ok(), is_whole, "{segment:?}");
         let why = segment.err().map(|spoilt| spoilt.words(1e-3));
         assert!(why.is_none_or(|why| why.starts_with("50 % of its frames")));
@@ -238,23 +234,10 @@ fn a_segment_that_lost_half_of_its_steps_is_measured_again_and_one_that_lost_a_t
 
 #[test]
 fn a_stall_is_no_reason_to_move_the_bead_less_and_a_bead_out_of_view_is() {
-    let calm = Lateness {
-        most_ns: 0.0,
-        often_ns: 0.0,
-        skipped: 0.0,
-        drift: 0.0,
-    };
-    let span = Span {
-        index: 0,
-        start: 0,
-        settle: 100,
-        rows: 800,
-    };
     let spoilt = |change: &dyn Fn(&mut Vec<TickRecord>)| {
-        let mut ticks = ticks(10.0, 2000, &calm);
+        let mut ticks = ticks(10.0, 2000, &CALM);
         change(&mut ticks);
-        let spoilt = Rows::of(&ticks, PERIOD_NS).segment(&span, 50).unwrap_err();
-        println!("{spoilt:?}");
+        let spoilt = Rows::of(&ticks, PERIOD_NS).segment(&SPAN, 50).unwrap_err();
         spoilt.is_out_of_view()
     };
     let gone = 600..680;
