@@ -306,7 +306,7 @@ impl Identification {
         })
     }
 
-    /// Covariance of the transfer function's coefficients, carried over from that of the fitted parameters.
+    /// Covariance of the transfer function's coefficients and of the delay, carried over from that of the fitted parameters.
     fn coefficient_covariance(&self) -> Covariance {
         let best = self.judged.model;
         let order = if best.slow_pole_rad_per_s != 0.0 {
@@ -355,8 +355,10 @@ impl Identification {
             }
         }
         let coefficients = |x: &[f64]| -> Vec<f64> {
-            let (num, den) = model_of(x, source.order).polynomials();
-            num.into_iter().chain(den.into_iter().skip(1)).collect()
+            let model = model_of(x, source.order);
+            let (num, den) = model.polynomials();
+            let plant = num.into_iter().chain(den.into_iter().skip(1));
+            plant.chain([model.delay_s]).collect()
         };
         let here = coefficients(&x);
         let mut jacobian = DMatrix::zeros(here.len(), x.len());
@@ -375,7 +377,8 @@ impl Identification {
         let (num, _) = model_of(&x, source.order).polynomials();
         let names = (0..num.len())
             .map(|i| format!("plant.num[{i}]"))
-            .chain((1..=here.len() - num.len()).map(|i| format!("plant.den[{i}]")))
+            .chain((1..here.len() - num.len()).map(|i| format!("plant.den[{i}]")))
+            .chain([Model::CAMERA_DELAY.to_owned()])
             .collect();
         Covariance {
             parameters: names,

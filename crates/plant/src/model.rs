@@ -30,7 +30,7 @@ impl Noise {
 /// Covariance of fitted parameters, as identify and reconcile write it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Covariance {
-    /// Names of the parameters, for example `plant.num[0]` or `time-delay.delay_s`.
+    /// Names of the parameters, for example `plant.num[0]`, `time-delay.delay_s`, or [`Model::CAMERA_DELAY`].
     pub parameters: Vec<String>,
     /// Row by row, in the units of the parameters.
     pub matrix: Vec<Vec<f64>>,
@@ -76,6 +76,8 @@ pub(crate) fn is_in_any_unit(provenance: &BTreeMap<String, String>) -> bool {
 }
 
 impl Model {
+    /// Name of [`Self::camera_delay_s`] in a covariance.
+    pub const CAMERA_DELAY: &str = "camera.delay_s";
     /// Key of the provenance with the units of a model's records, if they are not micrometres.
     pub const UNITS: &str = "units";
 

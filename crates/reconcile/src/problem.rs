@@ -7,7 +7,8 @@ use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
 use crate::data::waits::waits;
 use crate::dot::dot;
-use crate::simulate::{Base, Input, Sampling, simulate};
+use crate::model_error::STEP;
+use crate::simulate::{Base, Effect, Input, Sampling, simulate};
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 use std::sync::Arc;
@@ -52,6 +53,8 @@ pub(crate) struct Prepared {
     pub sampling: Sampling,
     /// Motions by which the plant may come to rest from where it was before the record, as they are.
     transients: Vec<Vec<f64>>,
+    /// Responses by which the model is off with a standard deviation of 1.
+    model_errors: Vec<Vec<f64>>,
     /// Where a zero flow that is off, and one that drifts, take the bead.
     flow: FlowPaths,
     /// Whether the noise has a zero flow that drifts.
@@ -76,17 +79,43 @@ impl Prepared {
         e
     }
 
+    /// Sum of squares of a residual in the rows of a mask, the stated error of the model left out of its covariance.
+    pub(crate) fn squares_without_model_errors(
+        &self,
+        noise: &NoiseModel,
+        residual: &[f64],
+        rows: &[Range<usize>],
+    ) -> f64 {
+        let free = Free::new(noise, &self.whitener, &self.transients, &self.flow, &[]);
+        let mut e = vec![0.0; residual.len()];
+        self.whitener.apply(residual, &mut e);
+        free.take_off(&mut e);
+        rows.iter().map(|r| dot(&e[r.clone()], &e[r.clone()])).sum()
+    }
+
     /// The filter of a noise, and orthonormal innovations of the transients under it.
     fn set_noise(&mut self, noise: &NoiseModel) {
         self.whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
         self.drifts = noise.zero_flow.is_some();
-        self.free = Free::new(noise, &self.whitener, &self.transients, &self.flow);
+        self.free = Free::new(
+            noise,
+            &self.whitener,
+            &self.transients,
+            &self.flow,
+            &self.model_errors,
+        );
     }
 
     /// Twice the negative log-likelihood of a residual under another noise, without a constant.
     pub(crate) fn unlikelihood(&self, noise: &NoiseModel, residual: &[f64]) -> f64 {
         let whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
-        let free = Free::new(noise, &whitener, &self.transients, &self.flow);
+        let free = Free::new(
+            noise,
+            &whitener,
+            &self.transients,
+            &self.flow,
+            &self.model_errors,
+        );
         let mut e = vec![0.0; residual.len()];
         whitener.apply(residual, &mut e);
         free.take_off(&mut e);
@@ -164,6 +193,32 @@ fn transients(base: &Base, flow: &FlowPaths, rows: usize) -> Vec<Vec<f64>> {
     all
 }
 
+/// A model, and others that are a small step of its stated error off, each with its effects.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Errors(pub(crate) Vec<(Base, Vec<Effect>)>);
+
+impl Errors {
+    /// Responses to a command by which the first is off.
+    fn responses(&self, u: &[f64], sampling: &Sampling) -> Vec<Vec<f64>> {
+        let response = |(base, effects): &(Base, Vec<Effect>)| {
+            let mut y = Vec::new();
+            simulate(base, Input::new(u, sampling), effects, &mut y, None);
+            y
+        };
+        let Some((model, off)) = self.0.split_first().filter(|(_, off)| !off.is_empty()) else {
+            return Vec::new();
+        };
+        let y = response(model);
+        let mut responses: Vec<Vec<f64>> = off.iter().map(response).collect();
+        for response in &mut responses {
+            for (r, y) in response.iter_mut().zip(&y) {
+                *r = (*r - y) / STEP;
+            }
+        }
+        responses
+    }
+}
+
 /// Where a zero flow takes the bead through the plant alone.
 fn flow_paths(base: &Base, rows: usize) -> FlowPaths {
     let mut off = Vec::new();
@@ -197,12 +252,14 @@ pub(crate) struct Problem {
 }
 
 impl Problem {
-    /// Prepares records; `repeated[i][k]` marks rows that repeat a frame and count as missing.
+    /// Prepares records; `repeated[i][k]` marks rows that repeat a frame and count as missing. `errors` tells by which responses the model
+    /// may be off, see [`crate::model_error`].
     pub(crate) fn new(
         base: Base,
         records: &[Record],
         repeated: &[Vec<bool>],
         noise: NoiseModel,
+        errors: &Errors,
     ) -> Self {
         let direct = if base.zpk.zeros.len() == base.zpk.poles.len() {
             base.zpk.gain.abs()
@@ -215,7 +272,7 @@ impl Problem {
         let prepared = records
             .iter()
             .zip(repeated)
-            .zip(waits(records))
+            .zip(waits(records, base.frame_age_s))
             .map(|((r, repeated), waits_s)| {
                 // How a sampled analogue input came from where it was before the record to its first sample is not known.
                 let run_in = if base.interpolated_input {
@@ -241,7 +298,12 @@ impl Problem {
                 let extra_walk = uncertain_command(r, velocity * base.sample_s);
                 let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
                 let flow = flow_paths(&base, r.rows());
+                let sampling = Sampling {
+                    exposure_s: r.exposure_s,
+                    waits_s,
+                };
                 let mut prepared = Prepared {
+                    model_errors: errors.responses(&u, &sampling),
                     transients: transients(&base, &flow, r.rows()),
                     flow,
                     drifts: false,
@@ -254,10 +316,7 @@ impl Problem {
                     whitener,
                     extra_walk,
                     rest: r.rests_within(THRESHOLDS.rest_share * range_um),
-                    sampling: Sampling {
-                        exposure_s: r.exposure_s,
-                        waits_s,
-                    },
+                    sampling,
                 };
                 prepared.set_noise(&noise);
                 prepared

@@ -109,7 +109,7 @@ mod tests {
         let whitener = Whitener::new(&noise, &vec![true; rows], None);
         let paths = FlowPaths::new((0..rows).map(|k| k as f64).collect());
         let transients = if off { vec![paths.off.clone()] } else { vec![] };
-        let free = Free::new(&noise, &whitener, &transients, &paths);
+        let free = Free::new(&noise, &whitener, &transients, &paths, &[]);
         motion_um(&noise, (&whitener, &free), &paths, off, &residual)
     }
 

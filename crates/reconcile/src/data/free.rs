@@ -1,8 +1,10 @@
-//! Motions of a record that are of any size (its level, its start) or of a size with a prior (a drift), in the space of innovations.
+//! Motions of a record that are of any size (its level, its start) or of a size with a prior (a drift, an error of the model), in the space
+//! of innovations.
 
 use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::dot::dot;
+use nalgebra::{DMatrix, SymmetricEigen};
 
 /// Orthonormal innovations of the free motions, each with the part to remove.
 #[derive(Debug, Clone, Default)]
@@ -14,12 +16,13 @@ pub(crate) struct Free {
 }
 
 impl Free {
-    /// Of transients of any size, and of the drift that the noise has.
+    /// Of transients of any size, of the drift that the noise has, and of further motions with a standard deviation of 1.
     pub(crate) fn new(
         noise: &NoiseModel,
         whitener: &Whitener,
         transients: &[Vec<f64>],
         flow: &FlowPaths,
+        further: &[Vec<f64>],
     ) -> Self {
         let mut free = Self::default();
         for t in transients {
@@ -30,22 +33,60 @@ impl Free {
                 free.directions.push((q, 1.0));
             }
         }
+        let times = |path: &[f64], size: f64| path.iter().map(|y| y * size).collect();
         let drift_um = noise.zero_flow.map_or(0.0, |z| z.drift_um);
-        if drift_um <= 0.0 {
-            return free;
+        let mut with_size: Vec<Vec<f64>> = Vec::new();
+        if drift_um > 0.0 {
+            // The working point is as old as the record is long, or older: since then the zero flow drifted by as much again.
+            let rows = flow.off.len() as f64;
+            with_size = vec![
+                times(&flow.drift, drift_um),
+                times(&flow.off, drift_um * rows),
+            ];
         }
-        // The working point is as old as the record is long, or older: since then the zero flow drifted by as much again.
-        let rows = flow.off.len() as f64;
-        let off: Vec<f64> = flow.off.iter().map(|y| y * rows).collect();
-        for path in [&flow.drift, &off] {
-            if let Some((q, size)) = free.direction(whitener, path) {
-                // The drift adds to the variance along its direction. Squares there count 1 / variance.
-                let variance = 1.0 + (drift_um * size).powi(2);
-                free.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
-                free.log_determinant += variance.ln();
-            }
-        }
+        free.add(
+            with_size
+                .iter()
+                .chain(further)
+                .map(|path| {
+                    let mut e = vec![0.0; path.len()];
+                    whitener.apply(path, &mut e);
+                    free.take_off(&mut e);
+                    e
+                })
+                .collect(),
+        );
         free
+    }
+
+    /// Adds innovations of motions of standard deviation 1. They are orthogonal to all before. Along each principal direction they add to
+    /// the variance; squares there count 1 / variance.
+    fn add(&mut self, motions: Vec<Vec<f64>>) {
+        let n = motions.len();
+        let products = DMatrix::from_fn(n, n, |i, j| dot(&motions[i], &motions[j]));
+        // The decomposition of what is not a number would never end.
+        if n == 0 || products.iter().any(|p| !p.is_finite()) {
+            return;
+        }
+        let eigen = SymmetricEigen::new(products);
+        let largest = eigen.eigenvalues.max();
+        for (&square, way) in eigen
+            .eigenvalues
+            .iter()
+            .zip(eigen.eigenvectors.column_iter())
+        {
+            if square <= 1e-9 * largest || square <= 1e-9 {
+                continue;
+            }
+            let mut q = vec![0.0; motions[0].len()];
+            for (motion, part) in motions.iter().zip(way.iter()) {
+                let part = part / square.sqrt();
+                q.iter_mut().zip(motion).for_each(|(q, e)| *q += part * e);
+            }
+            let variance = 1.0 + square;
+            self.directions.push((q, 1.0 - 1.0 / variance.sqrt()));
+            self.log_determinant += variance.ln();
+        }
     }
 
     /// The direction of a motion without its part along the earlier directions, and its size.
@@ -88,7 +129,7 @@ impl Free {
         }
     }
 
-    /// What the drift adds to the logarithm of the determinant.
+    /// What motions with a prior add to the logarithm of the determinant.
     pub(crate) fn log_determinant(&self) -> f64 {
         self.log_determinant
     }
@@ -113,7 +154,7 @@ mod tests {
         let y = [0.0, 0.03, 0.11];
         let whitener = Whitener::new(&noise, &[true; 3], None);
         let flow = FlowPaths::new(vec![0.0, 1.0, 2.0]);
-        let free = Free::new(&noise, &whitener, &[], &flow);
+        let free = Free::new(&noise, &whitener, &[], &flow, &[]);
         let mut e = [0.0; 3];
         whitener.apply(&y, &mut e);
         free.take_off(&mut e);

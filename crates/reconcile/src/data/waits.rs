@@ -10,19 +10,21 @@ use crate::data::record::Record;
 const ROWS: usize = 51;
 /// Waits below this part of a row are the jitter of the stamps.
 const LEAST: f64 = 0.01;
-/// Share of the rows that are taken to have waited least: their age is that of the camera's path alone.
+/// Share of the rows that are taken to have waited least, if no age is stated: their age is that of the camera's path alone.
 const YOUNGEST: f64 = 0.1;
 
-/// Waits of the rows of every record \[s\]; none for a record without ages, and for all if no frame waited.
-pub(crate) fn waits(records: &[Record]) -> Vec<Vec<f64>> {
+/// Waits of the rows of every record \[s\]: how much older their frames are than those of the model's delay, else than the youngest. None
+/// for a record without ages, and for all if no frame waited.
+pub(crate) fn waits(records: &[Record], stated_s: Option<f64>) -> Vec<Vec<f64>> {
     let mut ages: Vec<Vec<f64>> = records.iter().map(|r| smooth(&r.frame_age_s)).collect();
     let mut sorted: Vec<f64> = ages.iter().flatten().copied().collect();
     sorted.sort_by(f64::total_cmp);
-    let Some(&youngest_s) = sorted.get((YOUNGEST * sorted.len() as f64) as usize) else {
+    let youngest_s = sorted.get((YOUNGEST * sorted.len() as f64) as usize);
+    let Some(from_s) = stated_s.or(youngest_s.copied()) else {
         return ages;
     };
     for (ages, r) in ages.iter_mut().zip(records) {
-        ages.iter_mut().for_each(|age| *age -= youngest_s);
+        ages.iter_mut().for_each(|age| *age -= from_s);
         if ages.iter().all(|age| age.abs() < LEAST * r.sample_s) {
             ages.clear();
         }
@@ -77,11 +79,15 @@ mod tests {
         let mut first: Vec<f64> = (0..2000).map(|k| 2e-3 + jitter(k) + late(k)).collect();
         first[1200] = f64::NAN;
         let second: Vec<f64> = (0..2000).map(|k| 2.1e-3 + jitter(k)).collect();
-        let all = waits(&[record(first.clone()), record(second), record(Vec::new())]);
+        let records = [record(first.clone()), record(second), record(Vec::new())];
+        let all = waits(&records, None);
         assert!((all[0][1200] - 2.5e-4).abs() < 1e-5, "{}", all[0][1200]);
         assert!(all[0][500].abs() < 1e-5 && (all[1][700] - 1e-4).abs() < 1e-5);
         assert!(all[2].is_empty());
         let calm: Vec<f64> = (0..2000).map(|k| 2e-3 + 0.3 * jitter(k)).collect();
-        assert!(waits(&[record(calm)])[0].is_empty());
+        assert!(waits(&[record(calm.clone())], None)[0].is_empty());
+        // A model that was made with frames of 1.9 ms: these waited for 0.1 ms longer.
+        let waited = &waits(&[record(calm)], Some(1.9e-3))[0];
+        assert!(waited.iter().all(|s| (s - 1e-4).abs() < 1e-5));
     }
 }

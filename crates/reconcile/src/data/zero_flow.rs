@@ -169,7 +169,7 @@ mod tests {
         let unlikelihood = |noise: &NoiseModel| {
             let whitener = Whitener::new(noise, &present, None);
             let flow = FlowPaths::new((0..series.len()).map(|k| k as f64).collect());
-            let free = Free::new(noise, &whitener, &[], &flow);
+            let free = Free::new(noise, &whitener, &[], &flow, &[]);
             let mut e = vec![0.0; series.len()];
             whitener.apply(series, &mut e);
             free.take_off(&mut e);

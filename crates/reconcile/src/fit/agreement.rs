@@ -50,6 +50,7 @@ fn carried(model: &Model, pzt_um: &[f64], flow_um: &[f64]) -> Vec<f64> {
         interpolated_input: false,
         free_start: false,
         free_working_point: false,
+        frame_age_s: None,
     };
     let u: Vec<f64> = pzt_um.iter().map(|v| v - 4.0).collect();
     let mut y = Vec::new();

@@ -74,6 +74,8 @@ pub(crate) struct Fit {
     pub locking: Vec<Option<Locking>>,
     /// Sum of squares over the mask.
     pub chi2: f64,
+    /// Of a fit without effects: sum of squares that the model's stated error takes off.
+    pub absorbed: f64,
     /// Gain of the last round of the descent; nothing once it stops.
     pub last_gain: f64,
     /// Innovations that count under the mask.

@@ -157,6 +157,7 @@ impl Context<'_> {
             innovations: Vec::new(),
             covariance: DMatrix::zeros(0, 0),
             log_information: 0.0,
+            absorbed: 0.0,
         };
         self.run(fit, mask, until, None)
     }
@@ -349,6 +350,19 @@ impl Context<'_> {
     /// Raw residual of a fit in the records that count under a mask; empty for the others.
     pub(crate) fn residual_under(&self, fit: &Fit, mask: &Mask) -> Vec<Vec<f64>> {
         self.state(fit, mask).residual
+    }
+
+    /// Sum of squares of a fit that the stated error of the model takes off.
+    pub(crate) fn absorbed(&self, fit: &Fit, mask: &Mask) -> f64 {
+        let residual = self.residual_under(fit, mask);
+        let records = self.problem.records.iter().zip(&residual).zip(mask);
+        let squares: f64 = records
+            .filter(|(_, rows)| !rows.is_empty())
+            .map(|((r, residual), rows)| {
+                r.squares_without_model_errors(&self.problem.noise, residual, rows)
+            })
+            .sum();
+        (squares - fit.chi2).max(0.0)
     }
 
     /// Raw residual of a fit, and its position with the lines that shake it.

@@ -45,7 +45,12 @@ pub(crate) fn left_over(fit: &Fit) -> f64 {
     (fit.chi2 - fit.count as f64).max(0.0)
 }
 
-/// The same beyond the error of a measured floor: a misfit for certain.
+/// Sum of squares beyond the noise by which model and records disagree without effects, the model's stated error included.
+pub(crate) fn gap(null: &Fit) -> f64 {
+    left_over(null) + null.absorbed
+}
+
+/// What is left over beyond the error of a measured floor: a misfit for certain.
 pub(crate) fn surely_left(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let noise = fit.count as f64 * (1.0 + ctx.floor_error).powi(2);
     (fit.chi2 - noise).max(0.0)
@@ -57,12 +62,13 @@ pub(crate) fn before_forms(ctx: &Context<'_>, null: &Fit, fit: &Fit, mask: &Mask
     let of_one_form =
         |p: &&Part| p.variant.is_gain() || matches!(p.effect(&ctx.scope).act(), Action::Delay(_));
     let exact: Vec<Part> = fit.parts.iter().filter(of_one_form).cloned().collect();
+    let before = null.chi2 + null.absorbed;
     let alone = match exact.len() {
-        0 => return null.chi2,
+        0 => return before,
         n if n == fit.parts.len() => fit.chi2,
         _ => ctx.fit_from(exact, Some(fit.soft), mask, 8).chi2,
     };
-    alone.min(null.chi2)
+    alone.min(before)
 }
 
 /// Scatter of a sum of squares over `n` rows: chance, and the error of the noise estimate.
@@ -83,8 +89,7 @@ fn whole(fit: &Fit) -> f64 {
 /// Whether a set leaves more than chance, and more than equations leave that are not nature's to the last digit.
 pub(crate) fn leaves_much(null: &Fit, fit: &Fit) -> bool {
     let left = left_over(fit);
-    left > THRESHOLDS.left_sd * scatter(fit.count as f64)
-        && left > (1.0 - whole(fit)) * left_over(null)
+    left > THRESHOLDS.left_sd * scatter(fit.count as f64) && left > (1.0 - whole(fit)) * gap(null)
 }
 
 /// A price for a main number outside the range that real rigs show: decides ties between names. A fit that leaves something over

@@ -5,7 +5,7 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::problem::Mask;
 use crate::search::cost::{
-    before_forms, leaves_much, left_over, penalised_cost, threshold, threshold_of,
+    before_forms, gap, leaves_much, left_over, penalised_cost, threshold, threshold_of,
 };
 use crate::search::effort::Effort;
 use crate::search::screen::screen;
@@ -323,7 +323,7 @@ fn much_left(fit: &Fit) -> bool {
 /// Whether a set of two or more cannot become an explanation. Even with the largest number of effects, each worth the average of
 /// the set, it would explain too little. A search takes the most valuable effects first.
 fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
-    let (whole, left, count) = (left_over(null), left_over(fit), fit.parts.len());
+    let (whole, left, count) = (gap(null), left_over(fit), fit.parts.len());
     let open = left - (whole - left) / count.max(1) as f64 * most.saturating_sub(count) as f64;
     count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
@@ -345,7 +345,8 @@ pub(crate) fn search(
     start: Option<&Fit>,
     mut progress: impl FnMut(&str),
 ) -> Found {
-    let null = ctx.fit(Vec::new(), mask, 6);
+    let mut null = ctx.fit(Vec::new(), mask, 6);
+    null.absorbed = ctx.absorbed(&null, mask);
     let mut steps = vec![(Vec::new(), null.chi2)];
     let begun = match start.filter(|f| !f.parts.is_empty()) {
         Some(start) => {

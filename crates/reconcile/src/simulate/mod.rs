@@ -31,6 +31,8 @@ pub(crate) struct Base {
     pub free_start: bool,
     /// The working point is not known: the ramp from its error is free in every record.
     pub free_working_point: bool,
+    /// Age of the frames for which the model's delay holds, if it is stated \[s\].
+    pub frame_age_s: Option<f64>,
 }
 
 impl Base {

@@ -180,7 +180,7 @@ fn gap(
     // The noise of these rows: the residual of the full fit, if it is the floor within its error.
     let in_sample = rms(fit.chi2);
     Gap {
-        before: held.before_um,
+        before: held.before_um.hypot(rms(null.absorbed)),
         after: held.after_um,
         floor: if in_sample <= 1.01 * sigma {
             in_sample

@@ -10,7 +10,7 @@ use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Columns;
-use crate::search::cost::{left_over, penalised_cost, prior_penalty};
+use crate::search::cost::{gap, penalised_cost, prior_penalty};
 use crate::search::sequential::Found;
 use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
@@ -37,7 +37,7 @@ const ROUNDS: usize = 12;
 pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) -> Aside {
     let mut aside = Aside::default();
     let all = ctx.problem.all();
-    let gap = left_over(&found.null).max(1e-12);
+    let gap = gap(&found.null).max(1e-12);
     one_form(ctx, found, &mut aside, threads);
     while found.fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..found.fit.parts.len()).collect();
@@ -106,7 +106,7 @@ fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize, without: &Fit) -> Op
 /// small compared with the others.
 fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: usize) {
     let all = ctx.problem.all();
-    let gap = left_over(&found.null).max(1e-12);
+    let gap = gap(&found.null).max(1e-12);
     let count = found.fit.parts.len();
     if count < 3 || !found.fit.parts.iter().all(may_be_form) {
         return;

@@ -52,7 +52,7 @@ pub(crate) struct Judgement {
 pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judgement {
     let n = e.null.count as f64;
     let scatter = scatter(n);
-    let excess = e.null.chi2 - n;
+    let excess = e.null.chi2 + e.null.absorbed - n;
     let left = e.fit.chi2 - n;
     let closed = if excess > 0.0 {
         1.0 - left.max(0.0) / excess
@@ -63,11 +63,12 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let library = battery::library(ctx, e.fit);
     let strongest = battery::strongest(&library, &ctx.tangents(e.fit, &all), e.fit, &all);
     // A term counts if it is beyond chance and beyond the residual of equations that differ in their last digits.
-    let gained = (e.null.chi2 - e.fit.chi2).max(0.0);
+    let gained = (excess - left).max(0.0);
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
     let much = leaves_much(e.null, e.fit);
-    let remains = much || term.is_some() || !e.aside.companions.is_empty();
+    let beyond_chance = much || term.is_some();
+    let remains = beyond_chance || !e.aside.companions.is_empty();
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
         reasons: Vec::new(),
@@ -118,14 +119,15 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         describe(ctx, e.null, &battery::library(ctx, e.null), None, &mut out);
         return out;
     }
-    let remains = remains || moved.is_some();
+    let beyond_chance = beyond_chance || moved.is_some();
+    let remains = remains || beyond_chance;
     // One of several names, next to a remainder: only if the set is complete but for the last digits of its equations.
     let least = match (e.cut_short, e.names.ambiguous) {
         (true, _) => THRESHOLDS.cut_closed,
         (false, true) => THRESHOLDS.closed_whole,
         (false, false) => THRESHOLDS.remainder_closed,
     };
-    if remains && closed < least {
+    if beyond_chance && closed < least {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",

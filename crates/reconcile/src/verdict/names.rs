@@ -99,7 +99,7 @@ pub(crate) fn names(
 ) -> Names {
     let all = ctx.problem.all();
     let n = null.count as f64;
-    let excess = null.chi2 - n;
+    let excess = null.chi2 + null.absorbed - n;
     let mut out = Names {
         effects: Vec::new(),
         ambiguous: false,
@@ -121,9 +121,13 @@ pub(crate) fn names(
         let gain = (without.chi2 - fit.chi2).max(0.0);
         out.curvature |= mostly_curvature(ctx, fit, i, gain)
             || form::remembers_nothing(ctx, part, &without, gain);
-        // A hysteresis that remembers nothing is the curve that it is, and no rival of another.
-        let remembers =
-            |r: &&Rival| !form::remembers_nothing(ctx, &r.part, &without, without.chi2 - r.chi2);
+        // A hysteresis that remembers nothing is the curve that it is, and no rival of another. A gain is such a curve.
+        let remembers = |r: &&Rival| {
+            let gained = without.chi2 - r.chi2;
+            let is_line = part.variant.is_gain() && gain > THRESHOLDS.curve_share * gained;
+            !(r.part.variant.memoryless().is_some() && is_line)
+                && !form::remembers_nothing(ctx, &r.part, &without, gained)
+        };
         let rivals: Vec<Rival> = (rivals.get(i).into_iter().flatten())
             .filter(remembers)
             .cloned()

@@ -9,8 +9,9 @@ use crate::data::record::{Record, canonical};
 use crate::error::ReconcileError;
 use crate::fit::context::{Context, Fit};
 use crate::fit::locking;
-use crate::problem::Problem;
-use crate::search::cost::left_over;
+use crate::model_error;
+use crate::problem::{Errors, Problem};
+use crate::search::cost::{gap, left_over};
 use crate::search::effort::Effort;
 use crate::search::sequential::{Found, ids, settle};
 use crate::simulate::{Base, Zpk};
@@ -122,7 +123,8 @@ fn within(
     let scope = scope_of(model, &records, &base, scales);
     let stated = stated_noise(model, base.sample_s);
     let start = stated.unwrap_or_else(|| NoiseModel::new(0.33, base.sample_s, 0.03));
-    let problem = Problem::new(base, &records, repeated, start);
+    let errors = errors_of(model, &base);
+    let problem = Problem::new(base, &records, repeated, start, &errors);
     let present = problem.present();
     let searching = Searching {
         model,
@@ -339,7 +341,7 @@ fn drop_bound(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
         parts.remove(i);
         let without = ctx.fit_from(parts, Some(found.fit.soft), &all, 12);
         let open = 1.0 - THRESHOLDS.closed_whole;
-        if left_over(&without) > open * left_over(&found.null) {
+        if left_over(&without) > open * gap(&found.null) {
             return;
         }
         (found.fit, found.rivals) = settle(ctx, without, None, &all, effort);
@@ -360,7 +362,24 @@ fn base_of(model: &Model, records: &[Record], options: &Options) -> Result<Base,
         interpolated_input: options.interpolated_input,
         free_start: options.free_start,
         free_working_point: options.free_working_point,
+        frame_age_s: model.frame_age_s,
     })
+}
+
+/// The model and its stated error. The plant of other data was fitted without a prior of its input: its covariance is that of the fit alone.
+fn errors_of(model: &Model, base: &Base) -> Errors {
+    let off = match base.free_start {
+        true => Vec::new(),
+        false => model_error::off_by_a_step(model),
+    };
+    let of = |model: &Model| {
+        let base = Base {
+            zpk: Zpk::of(&model.plant),
+            ..base.clone()
+        };
+        (base, model.effects.clone())
+    };
+    Errors(std::iter::once(model).chain(&off).map(of).collect())
 }
 
 fn scope_of(model: &Model, records: &[Record], base: &Base, scales: &Scales) -> Scope {

@@ -266,7 +266,10 @@ pub fn look(
             &file,
             progress,
         )?;
-        options.free_working_point |= at_rest(model, &record, neutral_um);
+        options.free_working_point = true;
+        if records.is_empty() {
+            model.working_point_um = neutral_um;
+        }
         collected.push(Collected {
             experiment: experiment.name(),
             what: experiment.what(),
@@ -278,17 +281,6 @@ pub fn look(
         });
         records.push(record);
     }
-}
-
-/// If the model was made at another working point, uses the one that the loop found. Returns whether it did: the working point is then
-/// known only as well as the loop found it.
-pub fn at_rest(model: &mut Model, record: &Record, neutral_um: f64) -> bool {
-    let (low, high) = record.pzt_range_um();
-    let elsewhere = !(low..=high).contains(&model.working_point_um);
-    if elsewhere {
-        model.working_point_um = neutral_um;
-    }
-    elsewhere
 }
 
 /// The path of a new file, so that nothing is overwritten.

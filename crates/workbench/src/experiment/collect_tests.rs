@@ -8,7 +8,7 @@
 //! Every seed is a different rig. Its zero flow wanders by 2 to 20 nm in 5 to 50 s and drifts by up to 5 nm/s. Its camera's clock is up
 //! to 15 ppm off and stalls now and then. Light and focus differ.
 
-use super::{Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, at_rest, look, neutral_um, refused};
+use super::{Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, look, neutral_um, refused};
 use crate::experiment::on_rig::OnRig;
 use cellpos_emulator::{FaultEvent, FaultKind, WorldConfig};
 use cellpos_numeric::Random;
@@ -189,10 +189,12 @@ fn kept(folder: &Path) -> Vec<Record> {
 /// Reconciles the records of an earlier run.
 fn again(records: &[Record]) -> Result<Reconciliation, Failure> {
     let mut model = Model::eq6();
-    let mut options = Options::default();
-    for record in records {
-        let neutral_um = neutral_um(record, model.plant.velocity_gain_at(Hertz(2.0)));
-        options.free_working_point |= at_rest(&mut model, record, neutral_um);
+    let options = Options {
+        free_working_point: true,
+        ..Options::default()
+    };
+    if let Some(first) = records.first() {
+        model.working_point_um = neutral_um(first, model.plant.velocity_gain_at(Hertz(2.0)));
     }
     reconcile(&model, records, &options, &mut |_| {}).map_err(refused)
 }

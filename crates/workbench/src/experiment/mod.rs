@@ -27,6 +27,7 @@ pub mod collect;
 pub mod excitation;
 mod exciting;
 pub mod identify;
+mod lateness;
 pub mod on_rig;
 pub mod paper;
 pub mod partner;

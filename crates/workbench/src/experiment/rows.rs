@@ -1,7 +1,10 @@
 //! The ticks of a run as an evenly sampled record, and the segments in it.
 
 use crate::experiment::exciting::SETTLE_TICKS;
-use cellpos_ident::analogue;
+use crate::experiment::lateness::{
+    HandedOver, LINE_PERIODS, age_ns, as_if_on_time, is_new_frame, lateness_ns, median,
+    with_new_frame,
+};
 use cellpos_ident::experiment::{RecordedSegment, Span};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
 
@@ -44,8 +47,9 @@ pub(crate) fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
 
 /// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
 pub(crate) struct Rows {
-    /// Command of each row, um, as if it had been on time.
+    /// Command of each row, um.
     pub(crate) input: Vec<f64>,
+    /// Position of each row, um, as if all commands had been on time; NaN without one.
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
     /// There was no tick at this row: the command before it was held.
@@ -64,86 +68,9 @@ pub(crate) struct Rows {
     of_tick: Vec<usize>,
 }
 
-/// How much later than usual the command of each tick was handed over, counted from the exposure of its frame, ns. Usual is the median of
-/// a second, in which clocks drift by a negligible amount. A tick without a frame comes when the frame is overdue.
-fn lateness_ns(ticks: &[TickRecord]) -> Vec<i64> {
-    const SECOND: usize = 1000;
-    let handed_over_ns = |tick: &TickRecord| age_ns(tick) + i64::from(tick.compute_ns);
-    let mut late_ns = Vec::with_capacity(ticks.len());
-    for ticks in ticks.chunks(SECOND) {
-        let usual_ns = median(with_new_frame(ticks).map(handed_over_ns)).unwrap_or(0);
-        late_ns.extend(ticks.iter().map(|tick| match is_new_frame(tick) {
-            true => handed_over_ns(tick) - usual_ns,
-            false => i64::MAX,
-        }));
-    }
-    late_ns
-}
-
-/// Lateness from which a command counts as late, ns: a tenth of a period, or more on a machine where too few commands would remain. A
-/// command can be moved within the band of the rows only: at 0.3 of the sampling rate a tenth of a period turns the first image of the
-/// held command, the fastest part of a record, by 36 degrees.
-fn tolerated_ns(late_ns: &[i64], period_ns: i64) -> i64 {
-    let known = late_ns.iter().filter(|&&ns| ns != i64::MAX);
-    let mut sorted: Vec<i64> = known.map(|ns| ns.saturating_abs()).collect();
-    sorted.sort_unstable();
-    // Without the two rows that may show a late command three steps from row to row are lost: at most a tenth of all.
-    let most_ns = sorted.get(sorted.len() * 29 / 30).copied().unwrap_or(0);
-    most_ns.max(period_ns / 10)
-}
-
-/// Commands that begin with their rows, for commands `held_um` that were handed over `late` rows after that. A command is a step at its
-/// time, and a step between two rows acts within the band of the rows as those that interpolate it.
-fn as_if_on_time(held_um: &[f64], late: &[f64]) -> Vec<f64> {
-    let mut steps_um = vec![0.0; held_um.len()];
-    let first_um = held_um.first().copied().unwrap_or(0.0);
-    let mut before_um = first_um;
-    for (row, (um, late)) in held_um.iter().zip(late).enumerate() {
-        let whole = late.floor();
-        let weights = analogue::weights(late - whole);
-        let begin = row as i64 + whole as i64 + 1 - weights.len() as i64 / 2;
-        for (weight, to) in weights.into_iter().zip(begin..) {
-            // A step before the first row acts in it.
-            if let Some(step_um) = steps_um.get_mut(to.max(0) as usize) {
-                *step_um += weight * (um - before_um);
-            }
-        }
-        before_um = *um;
-    }
-    let sum = |um: &mut f64, step_um: f64| {
-        *um += step_um;
-        Some(*um)
-    };
-    steps_um.into_iter().scan(first_um, sum).collect()
-}
-
-/// Upper limit of the delay from a command to its effect, in periods: at 1 kHz over USB or a serial line, with the lateness of a tick
-/// included.
-const LINE_PERIODS: f64 = 1.0;
-
-fn is_new_frame(tick: &TickRecord) -> bool {
-    !tick.flags.has(TickFlags::TIMER) && !tick.flags.has(TickFlags::STALE)
-}
-
-fn with_new_frame(ticks: &[TickRecord]) -> impl Iterator<Item = &TickRecord> {
-    ticks.iter().filter(|tick| is_new_frame(tick))
-}
-
 /// How old the frame of a tick is, by its own stamp, ns; `None` for a tick without a new frame.
 pub fn frame_age_ns(tick: &TickRecord) -> Option<i64> {
     is_new_frame(tick).then(|| age_ns(tick))
-}
-
-/// How old a tick's frame is, by its own stamp, ns.
-fn age_ns(tick: &TickRecord) -> i64 {
-    tick.time_ns - tick.mid_exposure_ns
-}
-
-/// The median, which a stall does not shift; `None` of an empty list.
-fn median(values: impl Iterator<Item = i64>) -> Option<i64> {
-    let mut values: Vec<i64> = values.collect();
-    values.sort_unstable();
-    values.get(values.len() / 2).copied()
 }
 
 /// Mean of the known ages, s.
@@ -178,15 +105,9 @@ impl Rows {
             .position(TickRecord::is_running)
             .unwrap_or(ticks.len());
         let usual_ns = median(with_new_frame(&ticks[closed..]).map(age_ns)).unwrap_or(0);
-        let late_ns = lateness_ns(&ticks[closed..]);
-        let tolerated_ns = tolerated_ns(&late_ns, period_ns);
-        // Counted from the mean, the lateness of what stands as if on time moves the images of the held commands both ways.
-        let in_time = |ns: &&i64| ns.saturating_abs() <= tolerated_ns;
-        let (sum_ns, count) =
-            (late_ns.iter().filter(in_time)).fold((0, 0), |(sum, count), ns| (sum + ns, count + 1));
-        let mean_late_ns = sum_ns / count.max(1);
+        let late_ns = lateness_ns(&ticks[closed..], period_ns);
         rows.usual_age_periods = usual_ns.max(0) as f64 / period_ns as f64;
-        let (mut first_id, mut late_periods) = (None, Vec::new());
+        let (mut first_id, mut handed_over) = (None, Vec::new());
         // The clock plays the excitation, so a tick's place in it is its number on the clock's grid.
         let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
         let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
@@ -212,23 +133,21 @@ impl Rows {
                 rows.unseen.push(false);
                 rows.without_bead.push(false);
                 rows.ages_ns.push(None);
-                late_periods.push(0.0);
             }
             let age_ns = age_ns(tick);
             // A frame half a period off the usual age belongs to another row.
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
-            let late = late_ns.abs() > tolerated_ns;
-            let late_ns = late_ns.saturating_sub(mean_late_ns);
             rows.skipped[row] = false;
-            rows.late[row] = late;
-            // No position shows the moment at which a late one acted: for those that are left, it was on time.
-            late_periods[row] = match late {
-                true => 0.0,
-                false => late_ns as f64 / period_ns as f64,
-            };
+            handed_over.extend(late_ns.map(|ns| HandedOver {
+                row: row as f64 + ns as f64 / period_ns as f64,
+                um: tick.command_um,
+            }));
+            // A command half a period late stands nearer to another row: the machine stalled.
+            let late_ns = late_ns.filter(|ns| 2 * ns.abs() < period_ns);
+            rows.late[row] = late_ns.is_none();
             // The row's command stands as if on time.
-            rows.ages_ns[row] = (on_time && !late).then_some(age_ns - late_ns);
+            rows.ages_ns[row] = late_ns.filter(|_| on_time).map(|late_ns| age_ns - late_ns);
             rows.input[row] = tick.command_um;
             rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
             rows.unseen[row] = is_unseen(tick);
@@ -240,7 +159,14 @@ impl Rows {
             rows.of_tick.resize(at.max(rows.of_tick.len()), row);
             rows.of_tick.push(row);
         }
-        rows.input = as_if_on_time(&rows.input, &late_periods);
+        let known: Vec<bool> = rows.late.iter().map(|late| !late).collect();
+        rows.output = as_if_on_time(
+            &rows.input,
+            &rows.output,
+            &handed_over,
+            &known,
+            rows.usual_age_periods,
+        );
         rows
     }
 

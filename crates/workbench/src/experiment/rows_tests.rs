@@ -20,6 +20,8 @@ struct Lateness {
     most_ns: f64,
     /// Largest delay of any tick, all being as likely, ns.
     often_ns: f64,
+    /// Lateness that repeats every tenth tick, as vision takes longer for a bead that goes faster, ns.
+    in_step_ns: f64,
     /// Share of ticks that never came.
     skipped: f64,
     /// Camera's clock against the loop's.
@@ -29,6 +31,7 @@ struct Lateness {
 const CALM: Lateness = Lateness {
     most_ns: 0.0,
     often_ns: 0.0,
+    in_step_ns: 0.0,
     skipped: 0.0,
     drift: 0.0,
 };
@@ -54,6 +57,8 @@ fn ticks(frequency_hz: f64, count: i64, late: &Lateness) -> Vec<TickRecord> {
     for k in 0..count {
         let due_ns = k * PERIOD_NS;
         let delay_ns = late.most_ns * spread(k, 0.618_033_988_75).powi(80)
+            + late.in_step_ns
+                * [0.1, 0.0, 0.9, 0.7, 0.4, 0.2, 1.0, 0.0, 0.1, 0.8][k.rem_euclid(10) as usize]
             + late.often_ns * (43_758.545_3 * (12.989_8 * k as f64).sin()).rem_euclid(1.0);
         if spread(k, 0.414_213_562_37) < late.skipped
             || ticks.last().is_some_and(|last| due_ns < last.time_ns)
@@ -136,10 +141,8 @@ fn over_the_true(frequency_hz: f64, late: &Lateness) -> (f64, f64, f64) {
 #[test]
 fn commands_that_are_all_late_by_chance_leave_the_response_and_little_scatter() {
     let late = Lateness {
-        most_ns: 0.0,
         often_ns: 0.9e6,
-        skipped: 0.0,
-        drift: 0.0,
+        ..CALM
     };
     for (frequency_hz, bias, scatter) in [(20.0, 1e-3, 0.7e-3), (100.0, 6e-3, 2.5e-3)] {
         let (gain, phase_deg, sd) = over_the_true(frequency_hz, &late);
@@ -154,36 +157,34 @@ fn commands_that_are_all_late_by_chance_leave_the_response_and_little_scatter() 
 
 #[test]
 fn ticks_that_are_late_or_skipped_and_a_camera_that_drifts_bend_neither_gain_nor_phase() {
-    let kept = Lateness {
-        most_ns: 0.0,
-        often_ns: 0.0,
-        skipped: 0.0,
-        drift: 0.0,
-    };
     let late = [
         Lateness {
             most_ns: 0.9e6,
-            ..kept
+            ..CALM
         },
         Lateness {
             most_ns: 4e6,
-            ..kept
+            ..CALM
         },
         Lateness {
             skipped: 0.05,
-            ..kept
+            ..CALM
         },
         Lateness {
             drift: 40e-6,
-            ..kept
+            ..CALM
         },
         Lateness {
             most_ns: 0.9e6,
             skipped: 0.02,
             drift: -15e-6,
-            ..kept
+            ..CALM
         },
-        kept,
+        Lateness {
+            in_step_ns: 0.3e6,
+            ..CALM
+        },
+        CALM,
     ];
     for frequency_hz in [20.0, 100.0, 300.0] {
         for (case, late) in late.iter().enumerate() {

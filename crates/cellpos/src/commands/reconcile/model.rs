@@ -1,7 +1,7 @@
 //! The model that a reconciliation extends: a file, a gain, or a base fitted to the records. The base is fitted again if that
 //! explains the difference.
 
-use super::records::{at_rest_of_records, fitted, with_camera_delay};
+use super::records::{at_rest_of_records, fitted, of_own_rig, with_camera_delay};
 use crate::commands::identify::HoldKind;
 use crate::commands::simulate::response;
 use crate::outcome::Failure;
@@ -70,7 +70,7 @@ pub(super) fn model_of(
     // A rig's own records move what rests on it; the fit of another plant to its data does not.
     let bead = !options.free_start && args.base.is_none();
     options.free_working_point = at_rest_of_records(&mut model, data.records, data.rests_um, bead);
-    if data.of_runs {
+    if data.of_runs || of_own_rig(data.records) {
         with_camera_delay(&mut model);
     }
     Ok(model)

@@ -197,15 +197,16 @@ fn held(t: &TickRecord) -> bool {
     t.is_controlled() && t.command_um.is_finite()
 }
 
-/// The rest of a bead differs from day to day. If no record comes near the model's working point, that of the runs is used, else
-/// that of the records of `bead`: the command at which such a bead neither goes nor comes.
-/// Whether it was: it is then no better known than these records tell.
+/// The rest of a bead differs from day to day. The working point of records of a rig of cellpos is the command at which their bead neither
+/// went nor came. That of other records is the model's, if one of them comes near it.
+/// Whether it is another than the model's: it is then no better known than these records tell.
 pub(super) fn at_rest_of_records(
     model: &mut Model,
     records: &[Record],
     rests_um: &[f64],
     bead: bool,
 ) -> bool {
+    let own = of_own_rig(records);
     let inside = records.iter().any(|r| {
         let (low, high) = r.pzt_range_um();
         (low..=high).contains(&model.working_point_um)
@@ -215,17 +216,24 @@ pub(super) fn at_rest_of_records(
         true => records.iter().map(|r| neutral_um(r, gain_per_s)).collect(),
         false => rests_um.to_vec(),
     };
-    if inside || of_records.is_empty() {
+    if inside && !own || of_records.is_empty() {
         return false;
     }
     let rest_um = of_records.iter().sum::<f64>() / of_records.len() as f64;
-    tracing::warn!(
-        "the model's working point, {} um, is outside of what was commanded: the bead of these records rested at {rest_um:.3} um, \
-         which is taken instead",
-        model.working_point_um
-    );
+    if !inside {
+        tracing::warn!(
+            "the model's working point, {} um, is outside of what was commanded: the bead of these records rested at {rest_um:.3} um, \
+             which is taken instead",
+            model.working_point_um
+        );
+    }
     model.working_point_um = rest_um;
     true
+}
+
+/// Whether records are of a rig of cellpos: those say when their frames were taken.
+pub(super) fn of_own_rig(records: &[Record]) -> bool {
+    records.iter().any(|r| !r.frame_age_s.is_empty())
 }
 
 /// Whether the commands look like volts: at 4 um per volt they would be at the model's working point.
@@ -240,6 +248,12 @@ pub(super) fn with_camera_delay(model: &mut Model) {
         && let Some(delay_s) = model.camera_delay_s.take().filter(|d| *d > 0.0)
     {
         model.effects.push(effects::time_delay(delay_s));
+        let stated = model.covariance.iter_mut();
+        for name in stated.flat_map(|stated| &mut stated.parameters) {
+            if name == Model::CAMERA_DELAY {
+                "time-delay.delay_s".clone_into(name);
+            }
+        }
     }
 }
 
