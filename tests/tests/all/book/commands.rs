@@ -58,7 +58,9 @@ fn run(page: &str, script: &str) -> Result<(), String> {
 
 fn try_page(page: &str, script: &str) -> Result<(), String> {
     let folder = tempfile::tempdir().unwrap();
-    copy_folder(&root().join("examples"), &folder.path().join("examples"));
+    for shown in ["examples", "tests/data/piezo-picma"] {
+        copy_folder(&root().join(shown), &folder.path().join(shown));
+    }
     let path = format!(
         "{}:{}",
         programs::folder().display(),
