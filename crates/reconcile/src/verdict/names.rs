@@ -73,7 +73,8 @@ fn alternatives(
         } else {
             0.0
         };
-        if r.chi2 + price - fit.chi2 < THRESHOLDS.tie && !decided {
+        let ties = r.chi2 + price - fit.chi2 < THRESHOLDS.tie && !decided;
+        if ties && !(richer && ends_as_well(ctx, fit, index, r)) {
             open |= !inseparable(id, r.id);
             found.push(r.id.to_owned());
         }
@@ -87,6 +88,22 @@ fn alternatives(
     }
     found.sort();
     (found, open)
+}
+
+/// Whether a rival explains as much with one of its times or rates at the end of its range, where it is a simpler effect. A relaxation that
+/// takes longer than a zero flow stands still is a gain.
+fn ends_as_well(ctx: &Context<'_>, fit: &Fit, index: usize, rival: &Rival) -> bool {
+    let before: usize = fit.parts[..index].iter().map(|p| p.theta.len()).sum();
+    let params = rival.part.variant().params.iter().enumerate();
+    params.filter(|(_, p)| p.log).any(|(j, p)| {
+        [p.lower, p.upper].into_iter().any(|end| {
+            let mut at_end = fit.clone();
+            at_end.parts[index] = rival.part.clone();
+            at_end.parts[index].theta[j] = p.coordinate(end);
+            let all = ctx.problem.all();
+            ctx.refit_with(&at_end, &all, 8, before + j).chi2 - fit.chi2 < THRESHOLDS.tie
+        })
+    })
 }
 
 /// The effects of a fit, with the rivals of each.
