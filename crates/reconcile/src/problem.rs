@@ -198,11 +198,12 @@ fn transients(base: &Base, flow: &FlowPaths, rows: usize) -> Vec<Vec<f64>> {
 pub(crate) struct Errors(pub(crate) Vec<(Base, Vec<Effect>)>);
 
 impl Errors {
-    /// Responses to a command by which the first is off.
-    fn responses(&self, u: &[f64], sampling: &Sampling) -> Vec<Vec<f64>> {
+    /// Responses to a command by which the first is off, beside further effects.
+    fn responses(&self, u: &[f64], sampling: &Sampling, beside: &[Effect]) -> Vec<Vec<f64>> {
         let response = |(base, effects): &(Base, Vec<Effect>)| {
             let mut y = Vec::new();
-            simulate(base, Input::new(u, sampling), effects, &mut y, None);
+            let effects = [effects, beside].concat();
+            simulate(base, Input::new(u, sampling), &effects, &mut y, None);
             y
         };
         let Some((model, off)) = self.0.split_first().filter(|(_, off)| !off.is_empty()) else {
@@ -239,6 +240,8 @@ fn flow_paths(base: &Base, rows: usize) -> FlowPaths {
 pub(crate) struct Problem {
     pub base: Base,
     pub records: Vec<Prepared>,
+    /// The model's stated error.
+    errors: Errors,
     pub noise: NoiseModel,
     /// Bounds of the share of the newest command's direct path that a frame already shows \[um per um\].
     ///
@@ -259,7 +262,7 @@ impl Problem {
         records: &[Record],
         repeated: &[Vec<bool>],
         noise: NoiseModel,
-        errors: &Errors,
+        errors: Errors,
     ) -> Self {
         let direct = if base.zpk.zeros.len() == base.zpk.poles.len() {
             base.zpk.gain.abs()
@@ -303,7 +306,7 @@ impl Problem {
                     waits_s,
                 };
                 let mut prepared = Prepared {
-                    model_errors: errors.responses(&u, &sampling),
+                    model_errors: errors.responses(&u, &sampling, &[]),
                     transients: transients(&base, &flow, r.rows()),
                     flow,
                     drifts: false,
@@ -325,6 +328,7 @@ impl Problem {
         Self {
             base,
             records: prepared,
+            errors,
             noise,
             soft: (-0.4 * kick, 1.3 * kick),
             quantised: records.iter().any(Record::is_quantised),
@@ -347,6 +351,23 @@ impl Problem {
         self.noise = noise;
         for r in &mut self.records {
             r.set_noise(&noise);
+        }
+        self
+    }
+
+    /// Whether the model states an error of its own.
+    pub(crate) fn has_errors(&self) -> bool {
+        self.errors.0.len() > 1
+    }
+
+    /// The same problem with the responses to the model's stated error beside a set of effects: a delay behind a lag shows as much less.
+    pub(crate) fn beside(mut self, effects: &[Effect]) -> Self {
+        if !self.has_errors() {
+            return self;
+        }
+        for r in &mut self.records {
+            r.model_errors = self.errors.responses(&r.u, &r.sampling, effects);
+            r.set_noise(&self.noise);
         }
         self
     }

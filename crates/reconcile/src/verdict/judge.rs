@@ -76,7 +76,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         remainder: None,
     };
     if e.fit.parts.is_empty() {
-        let beyond = excess > CHANCE_SD * scatter || e.null_flagged || term.is_some();
+        let beyond = left > CHANCE_SD * scatter || e.null_flagged || term.is_some();
         if !e.floor.source.is_known() && beyond {
             out.verdict = Verdict::Unknown;
             out.reasons

@@ -53,6 +53,10 @@ impl Searching<'_> {
         }
     }
 
+    fn effects(&self, fit: &Fit) -> Vec<Effect> {
+        fit.parts.iter().map(|p| p.effect(&self.scope)).collect()
+    }
+
     /// Searches, and once more with the noise that the first set leaves.
     pub(super) fn search(
         &self,
@@ -120,6 +124,13 @@ impl Searching<'_> {
         let median = prior_of(&problem).median(&problem.noise);
         let beside = problem.clone().with_noise(median);
         let mut moving = self.search(beside, floor, effort, None, &mut *progress);
+        // The first set was found with the errors of the model as they show without it, and part of it may stand for the difference.
+        if problem.has_errors() && !moving.found.cut_short && !moving.found.fit.parts.is_empty() {
+            progress("once more with the model's stated error beside the set");
+            let next = moving.problem.beside(&self.effects(&moving.found.fit));
+            let start = Some(moving.found.fit);
+            moving = self.search(next, floor, effort, start, &mut *progress);
+        }
         for _ in 0..MOST_ROUNDS {
             if moving.found.cut_short {
                 return moving;
@@ -141,6 +152,7 @@ impl Searching<'_> {
             zero_flow: None,
             ..moving.problem.noise
         };
+        let problem = problem.beside(&self.effects(&moving.found.fit));
         let problem = problem.with_noise(noise);
         let start = Some(moving.found.fit.clone());
         let still = self.search(problem, floor, effort, start, &mut *progress);
@@ -158,7 +170,8 @@ impl Searching<'_> {
         }
     }
 
-    /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow.
+    /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow. The model's
+    /// stated error acts beside the set.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
         /// A path gains half as much as the previous one.
         const MOST_PATHS: usize = 12;
@@ -172,9 +185,10 @@ impl Searching<'_> {
             }
         };
         let left = residual(problem, fit);
+        let problem = problem.clone().beside(&self.effects(fit));
         let noise =
-            prior_of(problem).estimate(&problem.noise, |noise| problem.unlikelihood(noise, &left));
-        let mut best = weighed(problem.clone().with_noise(noise), fit);
+            prior_of(&problem).estimate(&problem.noise, |noise| problem.unlikelihood(noise, &left));
+        let mut best = weighed(problem.with_noise(noise), fit);
         for _ in 0..MOST_PATHS {
             let left = residual(&best.problem, &best.fit);
             let next = weighed(best.problem.clone().with_flow(&left), &best.fit);

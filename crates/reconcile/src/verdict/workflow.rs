@@ -124,7 +124,7 @@ fn within(
     let stated = stated_noise(model, base.sample_s);
     let start = stated.unwrap_or_else(|| NoiseModel::new(0.33, base.sample_s, 0.03));
     let errors = errors_of(model, &base);
-    let problem = Problem::new(base, &records, repeated, start, &errors);
+    let problem = Problem::new(base, &records, repeated, start, errors);
     let present = problem.present();
     let searching = Searching {
         model,

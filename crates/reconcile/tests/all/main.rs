@@ -5,6 +5,7 @@ mod closed_loop_table;
 mod labelled;
 mod measured;
 mod measured_piezo;
+mod model_error;
 mod noise;
 mod nulls;
 mod same;
