@@ -46,6 +46,9 @@ const PROFILE_RISE: f64 = 3.841;
 /// Factor from a 95 % to a 99.9 % interval: two 95 % intervals fail to overlap by chance in a few runs of a hundred.
 const SURE: f64 = 3.29 / Z95;
 
+/// Rise of chi-squared between the middles of two 99.9 % intervals that touch: a delay measured otherwise costs a fit no more.
+const MOST_APART: f64 = (2.0 * 3.29) * (2.0 * 3.29);
+
 /// Error that neither LED test nor phase slope covers, s: half of the converter's update step of 0.1 ms. The edges of the LED fall
 /// anywhere in a step; the commands of a loop come at one place in it, which changes with the machine's load.
 pub const NOT_ACCOUNTED_S: f64 = 5e-5;
@@ -389,5 +392,7 @@ fn with_prior(
             with.fit_from(&data, order, &start, None)
         })
         .min_by(|a, b| a.chi2.total_cmp(&b.chi2));
+    // What fits worse by more than that found no minimum.
+    let found = found.filter(|f| f.chi2 <= best.chi2 + MOST_APART * fit.scale);
     found.map_or(best.model, |f| model_of(&f.parameters, order))
 }

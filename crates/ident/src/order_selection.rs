@@ -438,7 +438,10 @@ impl<'a> OrderSelection<'a> {
             // Eq. (1)-(3) are passive, so an order with an unstable pole describes something else. A negative delay is impossible too.
             let passive = high.model.slow_pole_rad_per_s >= 0.0
                 && (high.model.delay_s >= 0.0 || !high.order.two_lags());
-            if p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out && passive {
+            // Numbers that the points leave open are none to build on.
+            let known = high.covariance.diagonal().iter().all(|v| v.is_finite());
+            let better = p_value < 0.01 && high.aicc < low.aicc && high.held_out < low.held_out;
+            if better && passive && known {
                 chosen = i;
             }
         }
