@@ -5,7 +5,7 @@ const SIDE: usize = 8;
 
 /// Weights of the samples around a place `at` between two of them, in parts of their distance from the first: a sinc under a Hann window.
 /// Half of the samples lie on each side.
-pub fn weights(at: f64) -> [f64; 2 * SIDE] {
+fn weights(at: f64) -> [f64; 2 * SIDE] {
     let mut all = [0.0; 2 * SIDE];
     for (i, w) in all.iter_mut().enumerate() {
         let x = std::f64::consts::PI * (at + (SIDE - 1) as f64 - i as f64);

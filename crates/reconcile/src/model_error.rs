@@ -21,13 +21,22 @@ pub(crate) fn off_by_a_step(model: &Model) -> Vec<Model> {
     };
     let n = stated.parameters.len();
     let of = |i: usize, j: usize| stated.matrix.get(i).and_then(|row| row.get(j)).copied();
-    let sd: Vec<f64> = (0..n)
-        .map(|i| of(i, i).unwrap_or(0.0).max(0.0).sqrt())
-        .collect();
+    let mut covariance = DMatrix::from_fn(n, n, |i, j| of(i, j).unwrap_or(0.0));
+    // A parameter that the model does not hold, such as a delay that is to be found, is no error of it: the others are as uncertain as
+    // with that one known.
+    for (k, _) in (stated.parameters.iter().enumerate()).filter(|(_, name)| !has(model, name)) {
+        let (row, variance) = (covariance.row(k).into_owned(), covariance[(k, k)]);
+        if variance > 0.0 {
+            covariance -= row.transpose() * &row / variance;
+        }
+        covariance.row_mut(k).fill(0.0);
+        covariance.column_mut(k).fill(0.0);
+    }
+    let sd: Vec<f64> = (covariance.diagonal().iter().map(|v| v.max(0.0).sqrt())).collect();
     // The parameters have different units, their correlations have none.
     let correlation = DMatrix::from_fn(n, n, |i, j| match sd[i] * sd[j] {
         0.0 => 0.0,
-        both => of(i, j).unwrap_or(0.0) / both,
+        both => covariance[(i, j)] / both,
     });
     // The decomposition of what is not a number would never end.
     if n == 0 || correlation.iter().any(|c| !c.is_finite()) {
@@ -51,6 +60,12 @@ pub(crate) fn off_by_a_step(model: &Model) -> Vec<Model> {
         .collect()
 }
 
+/// Whether a model holds a parameter.
+fn has(model: &Model, name: &str) -> bool {
+    let of = name.split_once('.').map_or(name, |(of, _)| of);
+    of == "plant" || model.effect(of).is_some()
+}
+
 /// The model with one parameter changed: `plant.num[0]` or `EFFECT.PARAMETER`. `None` if the result is no model, or has no such
 /// parameter.
 fn moved_by(mut model: Model, name: &str, by: f64) -> Option<Model> {
@@ -70,10 +85,7 @@ fn moved_by(mut model: Model, name: &str, by: f64) -> Option<Model> {
         model.plant = TransferFunction::new(num, den).ok()?;
         return Some(model);
     }
-    // What is not in the model moves nothing.
-    let Some(effect) = model.effects.iter_mut().find(|e| e.id() == of) else {
-        return Some(model);
-    };
+    let effect = model.effects.iter_mut().find(|e| e.id() == of)?;
     let stated = effect.parameters();
     let value = stated.iter().find(|p| p.name == parameter)?.value;
     *effect = effect.with_parameter(parameter, value + by).ok()?;
@@ -117,6 +129,21 @@ mod tests {
             let found: f64 = steps.iter().map(|s| s[i] * s[j]).sum();
             assert!((found / stated - 1.0).abs() < 1e-6, "{i} {j}: {found}");
         }
+    }
+
+    #[test]
+    fn a_delay_that_is_not_in_the_model_is_known() {
+        let matrix = vec![
+            vec![16.0, 0.0, 0.8 * 4.0 * 1e-4],
+            vec![0.0, 0.0, 0.0],
+            vec![0.8 * 4.0 * 1e-4, 0.0, 1e-8],
+        ];
+        let mut model = model(matrix);
+        model.effects.clear();
+        let off = off_by_a_step(&model);
+        assert_eq!(off.len(), 1);
+        let by = (off[0].plant.num()[0] - 400.0) / STEP;
+        assert!((by.abs() - 4.0 * 0.6).abs() < 1e-6, "{by}");
     }
 
     #[test]
