@@ -337,6 +337,13 @@ fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(
     Some((best, singles.take(2).collect()))
 }
 
+/// The model alone.
+fn without_effects(ctx: &Context<'_>, mask: &Mask) -> Fit {
+    let mut null = ctx.fit(Vec::new(), mask, 6);
+    null.absorbed = ctx.absorbed(&null, mask);
+    null
+}
+
 /// The whole search on the rows of a mask; with `start`, on from a set that was found under another noise.
 pub(crate) fn search(
     ctx: &Context<'_>,
@@ -345,8 +352,7 @@ pub(crate) fn search(
     start: Option<&Fit>,
     mut progress: impl FnMut(&str),
 ) -> Found {
-    let mut null = ctx.fit(Vec::new(), mask, 6);
-    null.absorbed = ctx.absorbed(&null, mask);
+    let null = without_effects(ctx, mask);
     let mut steps = vec![(Vec::new(), null.chi2)];
     let begun = match start.filter(|f| !f.parts.is_empty()) {
         Some(start) => {

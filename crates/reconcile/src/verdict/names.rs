@@ -139,14 +139,14 @@ pub(crate) fn names(
         out.curvature |= mostly_curvature(ctx, fit, i, gain)
             || form::remembers_nothing(ctx, part, &without, gain);
         // A hysteresis that remembers nothing is the curve that it is, and no rival of another. A gain is such a curve.
-        let remembers = |r: &&Rival| {
+        let forgets = |r: &Rival| {
             let gained = without.chi2 - r.chi2;
             let is_line = part.variant.is_gain() && gain > THRESHOLDS.curve_share * gained;
-            !(r.part.variant.memoryless().is_some() && is_line)
-                && !form::remembers_nothing(ctx, &r.part, &without, gained)
+            r.part.variant.memoryless().is_some() && is_line
+                || form::remembers_nothing(ctx, &r.part, &without, gained)
         };
         let rivals: Vec<Rival> = (rivals.get(i).into_iter().flatten())
-            .filter(remembers)
+            .filter(|r| !forgets(r))
             .cloned()
             .collect();
         let (alternatives, open) = alternatives(ctx, fit, i, &rivals);
