@@ -1,6 +1,6 @@
-//! How far a model may be off by its own statement: what the experiment that made it could not tell.
+//! How far a model may be off by its own statement.
 //!
-//! A model that was identified has a covariance. A response by which it may be off is no evidence for an effect, so these responses enter the
+//! A model that was identified has a covariance. A response by which it may be off is no evidence for an effect. So these responses enter the
 //! covariance of the residuals, one for each principal direction of the parameters. Without them an error of the delay by two of its standard
 //! deviations would be named, or hide a name.
 
@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, SymmetricEigen};
 
 use cellpos_plant::{Model, TransferFunction};
 
-/// Part of a standard deviation by which a model is moved: its response goes with the parameters there.
+/// Part of a standard deviation by which a model is moved: there its response is linear in the parameters.
 pub(crate) const STEP: f64 = 0.05;
 /// Directions with less than this part of the largest correlation are rounding.
 const LEAST: f64 = 1e-9;
@@ -38,7 +38,7 @@ pub(crate) fn off_by_a_step(model: &Model) -> Vec<Model> {
         0.0 => 0.0,
         both => covariance[(i, j)] / both,
     });
-    // The decomposition of what is not a number would never end.
+    // The decomposition of NaN would never end.
     if n == 0 || correlation.iter().any(|c| !c.is_finite()) {
         return Vec::new();
     }

@@ -178,7 +178,6 @@ pub(crate) fn run(args: Args) -> CommandResult {
     let data = Data {
         records: &records,
         rests_um: &rests_um,
-        of_runs: files.iter().all(|file| is_run(file)),
     };
     let asked = Asked {
         model: &args.model,

@@ -1,5 +1,5 @@
-//! Motions of a record that are of any size (its level, its start) or of a size with a prior (a drift, an error of the model), in the space
-//! of innovations.
+//! Free motions of a record, in the space of innovations. Some are of any size: its level, its start. Others have a size with a prior: a
+//! drift, an error of the model.
 
 use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
@@ -64,7 +64,7 @@ impl Free {
     fn add(&mut self, motions: Vec<Vec<f64>>) {
         let n = motions.len();
         let products = DMatrix::from_fn(n, n, |i, j| dot(&motions[i], &motions[j]));
-        // The decomposition of what is not a number would never end.
+        // The decomposition of NaN would never end.
         if n == 0 || products.iter().any(|p| !p.is_finite()) {
             return;
         }
@@ -94,10 +94,7 @@ impl Free {
         let mut w = vec![0.0; motion.len()];
         whitener.apply(motion, &mut w);
         let all = dot(&w, &w);
-        for (q, _) in &self.directions {
-            let share = dot(q, &w);
-            w.iter_mut().zip(q).for_each(|(w, q)| *w -= share * q);
-        }
+        self.take_off(&mut w);
         let left = dot(&w, &w);
         if left <= 1e-9 * all || left <= 0.0 {
             return None;

@@ -138,15 +138,11 @@ pub(crate) fn names(
         let gain = (without.chi2 - fit.chi2).max(0.0);
         out.curvature |= mostly_curvature(ctx, fit, i, gain)
             || form::remembers_nothing(ctx, part, &without, gain);
-        // A hysteresis that remembers nothing is the curve that it is, and no rival of another. A gain is such a curve.
-        let forgets = |r: &Rival| {
-            let gained = without.chi2 - r.chi2;
-            let is_line = part.variant.is_gain() && gain > THRESHOLDS.curve_share * gained;
-            r.part.variant.memoryless().is_some() && is_line
-                || form::remembers_nothing(ctx, &r.part, &without, gained)
-        };
+        // A hysteresis that remembers nothing is the curve that it is, and no rival of another.
+        let remembers =
+            |r: &&Rival| !form::remembers_nothing(ctx, &r.part, &without, without.chi2 - r.chi2);
         let rivals: Vec<Rival> = (rivals.get(i).into_iter().flatten())
-            .filter(|r| !forgets(r))
+            .filter(remembers)
             .cloned()
             .collect();
         let (alternatives, open) = alternatives(ctx, fit, i, &rivals);

@@ -64,12 +64,12 @@ struct Motion {
 impl Motion {
     /// The motion that fits best to rows whose commands were on time and whose frames are so many rows old. `None` if the commands do not
     /// vary, or too few rows are left.
-    fn of(command_um: &[f64], position_um: &[f64], known: &[bool], age: f64) -> Option<Self> {
+    fn of(command_um: &[f64], position_um: &[f64], late: &[bool], age: f64) -> Option<Self> {
         /// Delays are tried in steps of this part of a row.
         const STEP: f64 = 0.01;
         let reach = (age + LINE_PERIODS) as usize + 1;
         let increments: Vec<(usize, f64)> = (reach..position_um.len().saturating_sub(1))
-            .filter(|&row| known[row - reach..=row].iter().all(|known| *known))
+            .filter(|&row| !late[row - reach..=row].contains(&true))
             .map(|row| (row, position_um[row + 1] - position_um[row]))
             .filter(|(_, um)| um.is_finite())
             .collect();
@@ -158,19 +158,19 @@ impl<I: Iterator<Item = HandedOver>> Integral<I> {
     }
 }
 
-/// Positions as they would be if the command of each row had been handed over with the row. `known` is a row whose command was nearly on
-/// time, `age` that of the frames in rows.
+/// Positions as they would be if the command of each row had been handed over with the row. A row is `late` if its command came half a
+/// row late or never; `age` is that of the frames in rows.
 pub(crate) fn as_if_on_time(
     command_um: &[f64],
     position_um: &[f64],
     handed_over: &[HandedOver],
-    known: &[bool],
+    late: &[bool],
     age: f64,
 ) -> Vec<f64> {
     let mut on_time_um = position_um.to_vec();
     // The first motion is found with the lateness in it, the second without.
     for _ in 0..2 {
-        let Some(motion) = Motion::of(command_um, &on_time_um, known, age) else {
+        let Some(motion) = Motion::of(command_um, &on_time_um, late, age) else {
             return position_um.to_vec();
         };
         let missing_um = motion.missing_um(command_um, handed_over);

@@ -159,12 +159,11 @@ impl Rows {
             rows.of_tick.resize(at.max(rows.of_tick.len()), row);
             rows.of_tick.push(row);
         }
-        let known: Vec<bool> = rows.late.iter().map(|late| !late).collect();
         rows.output = as_if_on_time(
             &rows.input,
             &rows.output,
             &handed_over,
-            &known,
+            &rows.late,
             rows.usual_age_periods,
         );
         rows

@@ -21,8 +21,6 @@ pub(super) struct Data<'a> {
     pub records: &'a [Record],
     /// Where the beads of run folders rested, um.
     pub rests_um: &'a [f64],
-    /// Whether all records are run folders.
-    pub of_runs: bool,
 }
 
 /// The model that is asked for.
@@ -70,7 +68,8 @@ pub(super) fn model_of(
     // A rig's own records move what rests on it; the fit of another plant to its data does not.
     let bead = !options.free_start && args.base.is_none();
     options.free_working_point = at_rest_of_records(&mut model, data.records, data.rests_um, bead);
-    if data.of_runs || of_own_rig(data.records) {
+    // Where there is no record yet, one of the rig is to be collected.
+    if data.records.is_empty() || of_own_rig(data.records) {
         with_camera_delay(&mut model);
     }
     Ok(model)
