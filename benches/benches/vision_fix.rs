@@ -15,6 +15,10 @@ const WINDOW: usize = 25;
 const RUNS: usize = 4000;
 const SNR: f64 = 40.0;
 const NOISE: f64 = 2.0;
+/// Ways of beads that move while the shutter is open, px.
+const MOVES_PX: [f64; 3] = [0.5, 1.0, 4.0];
+/// Places along a way at which a moving bead is drawn.
+const DRAWN: usize = 16;
 
 fn main() {
     let spec = ProfileSpec::Ring {
@@ -29,7 +33,11 @@ fn main() {
     let mut symmetry = RadialSymmetry::new(WINDOW);
     let mut detector = Detector::new(&localiser, 8);
     let mut random = Random(1);
-    let scenes: Vec<Scene> = (0..RUNS).map(|_| Scene::new(&mut random)).collect();
+    let mut scenes_of = |way_px| -> Vec<Scene> {
+        let scene = |_| Scene::new(&mut random, way_px);
+        (0..RUNS).map(scene).collect()
+    };
+    let scenes = scenes_of(0.0);
 
     println!(
         "conditions: ring profile, edge 6.373 px, SNR {SNR}, 8-bit frames of {SIDE} x {SIDE} px, window {WINDOW} x {WINDOW} px,"
@@ -47,6 +55,16 @@ fn main() {
         let fix = localiser.locate(&s.frame(), Some(frame(s).2));
         Some((fix.x_px, fix.y_px))
     });
+    for way_px in MOVES_PX {
+        let moving = scenes_of(way_px);
+        localiser.expect_streak((way_px, 0.0));
+        let name = format!("template fit, {way_px} px of way while exposed");
+        run(&name, &moving, |s| {
+            let fix = localiser.locate(&s.frame(), Some(frame(s).2));
+            Some((fix.x_px, fix.y_px))
+        });
+    }
+    localiser.expect_streak((0.0, 0.0));
     run("template fit, whole frame searched first", &scenes, |s| {
         let fix = localiser.locate(&s.frame(), None);
         Some((fix.x_px, fix.y_px))
@@ -115,14 +133,19 @@ struct Scene {
 }
 
 impl Scene {
-    fn new(random: &mut Random) -> Self {
+    /// Of a bead that goes `way_px` along the row while the shutter is open.
+    fn new(random: &mut Random, way_px: f64) -> Self {
         let (x, y) = (28.0 + 8.0 * random.uniform(), 28.0 + 8.0 * random.uniform());
         let spec = ProfileSpec::Ring {
             edge_px: RingProfile::MEASURED_EDGE_PX,
         };
         let template = spec.template(PixelResponse::Point).expect("a valid size");
         let mut image = vec![110.0_f32; SIDE * SIDE];
-        template.draw(&mut image, SIDE, x, y, SNR * NOISE);
+        for k in 0..DRAWN {
+            let along = (k as f64 + 0.5) / DRAWN as f64 - 0.5;
+            let share = SNR * NOISE / DRAWN as f64;
+            template.draw(&mut image, SIDE, x + along * way_px, y, share);
+        }
         let pixels = image
             .iter()
             .map(|v| (f64::from(*v) + NOISE * random.normal()).round() as u8)

@@ -8,10 +8,10 @@ use nalgebra::Complex;
 use crate::error::IdentError;
 use crate::excitation::{ExcitationLimits, Signal, Tone, fold, shaped_amplitude_um};
 use crate::frequency_response::{
-    DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure, scatter_of_rest,
+    DrivenStretch, FrequencyPoint, SegmentResponse, Settings, measure, measure_by_rest,
 };
 use crate::noise::apply_noise_model;
-use crate::rest::{Rest, plant_of};
+use crate::rest::{Rest, later, plant_of};
 use crate::sampled::Sampling;
 pub use crate::segments::{
     Cause, Measured, RecordedSegment, Schedule, Span, Stopped, common_age_s,
@@ -445,7 +445,14 @@ impl Plan {
         for ((segment, settings), response) in driven.zip(&mut measured.segments) {
             let later_s = response.points.first().map_or(0.0, |p| p.later_s);
             let rest = Rest::of(&segment, &model, later_s, sampling);
-            scatter_of_rest(&mut response.points, &segment, &settings, &rest.rows);
+            let of_plant = |hz| later(&model, later_s).sampled_response(hz, sampling);
+            measure_by_rest(
+                &mut response.points,
+                &segment,
+                &settings,
+                &rest.rows,
+                of_plant,
+            );
             for point in &mut response.points {
                 point.velocity_changes = rest.velocity_changes;
             }

@@ -279,13 +279,16 @@ fn borders(segment: &DrivenStretch<'_>, settings: &Settings, all_hz: &[f64]) -> 
     )
 }
 
-/// Replaces the scatter of `points`, the driven lines of `segment`, by that of `rest`: its output less the response of a plant to its
-/// input. What a block's input began before the block, and what it leaves to the next, is then no scatter.
-pub(crate) fn scatter_of_rest(
+/// Replaces response and scatter of `points`, the driven lines of `segment`, by what `rest` adds to the response of a plant, and by its
+/// scatter: the rest is the output less the response of that plant to the input, and `of_plant` is that response at a frequency. What a
+/// block's input began before the block, and what it leaves to the next, is then neither scatter nor bias; nor is what an input that
+/// answers the output did while rows were missing from the output.
+pub(crate) fn measure_by_rest(
     points: &mut [FrequencyPoint],
     segment: &DrivenStretch<'_>,
     settings: &Settings,
     rest: &[f64],
+    of_plant: impl Fn(f64) -> Complex<f64>,
 ) {
     let all: Vec<f64> = [segment.lines_hz, segment.detection_hz].concat();
     let of_block = |w: &[usize]| {
@@ -301,6 +304,8 @@ pub(crate) fn scatter_of_rest(
     for (i, point) in points.iter_mut().enumerate() {
         let own: Vec<Complex<f64>> = blocks.iter().map(|block| block.phasors[i]).collect();
         let common = mean(&own);
+        point.response = of_plant(point.frequency_hz) + common / point.input;
+        point.output = point.response * point.input;
         point.block_errors = own.iter().map(|e| (e - common) / point.input).collect();
         let sum: f64 = point.block_errors.iter().map(|e| e.norm_sqr()).sum();
         point.scatter_variance = sum / (count * (count - 1.0));

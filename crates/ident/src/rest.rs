@@ -54,7 +54,8 @@ pub(crate) fn plant_of(
     Ok(problem.fit()?.best().model)
 }
 
-fn later(model: &CandidateModel, later_s: f64) -> CandidateModel {
+/// A plant whose frames are older.
+pub(crate) fn later(model: &CandidateModel, later_s: f64) -> CandidateModel {
     let delay_s = model.delay_s + later_s;
     CandidateModel { delay_s, ..*model }
 }

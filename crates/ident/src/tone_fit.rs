@@ -2,8 +2,9 @@
 //!
 //! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has separate regressors. The
 //! noise of a freely diffusing bead is a random walk, so its increments are white, and least squares on them is the best linear estimate.
-//! The fit uses increments and converts the phasors back exactly (`Y = dY/(1 - e^(-jw))`). Rows without a bead (`NaN`) are left out. Not
-//! for records whose input is not periodic.
+//! The fit uses increments and converts the phasors back exactly (`Y = dY/(1 - e^(-jw))`). Over rows without a bead (`NaN`) one longer
+//! increment is fitted: what the bead did there would otherwise be missing from the output and not from the input, and a loop that goes
+//! without a position commands something else. Not for records whose input is not periodic.
 
 use nalgebra::{Complex, DMatrix, DVector};
 
@@ -82,7 +83,14 @@ pub fn fit_block(
     let mut right = DVector::<f64>::zeros(columns);
     let mut sum_squares = 0.0;
     let mut rows = 0usize;
+    // Regressors of the rows since the last one with a value: an increment over a gap is the sum of its rows' increments.
     let mut row = vec![0.0; columns];
+    let mut since = 0;
+    let mut last = if increments {
+        signal.get(from).copied().unwrap_or(f64::NAN)
+    } else {
+        0.0
+    };
     let mut rotors: Vec<Complex<f64>> = angles
         .iter()
         .map(|a| Complex::from_polar(1.0, (a * first as f64) % (2.0 * std::f64::consts::PI)))
@@ -91,29 +99,36 @@ pub fn fit_block(
         .iter()
         .map(|&a| Complex::from_polar(1.0, a))
         .collect();
-    for k in first..to {
-        let value = if increments {
-            signal[k] - signal[k - 1]
-        } else {
-            signal[k]
-        };
+    for (k, &level) in signal.iter().enumerate().take(to).skip(first) {
+        for (i, r) in rotors.iter().enumerate() {
+            row[2 * i] += r.re;
+            row[2 * i + 1] += r.im;
+        }
+        let x = (k as f64 - middle) / half;
+        for d in 0..drift_columns {
+            row[2 * angles.len() + d] += x.powi(d as i32);
+        }
+        since += 1;
+        let value = level - last;
         if value.is_finite() {
-            for (i, r) in rotors.iter().enumerate() {
-                row[2 * i] = r.re;
-                row[2 * i + 1] = r.im;
-            }
-            let x = (k as f64 - middle) / half;
-            for d in 0..drift_columns {
-                row[2 * angles.len() + d] = x.powi(d as i32);
-            }
+            // The variance of a walk grows by the row.
+            let weight = 1.0 / f64::from(since);
             for (i, &a) in row.iter().enumerate() {
-                right[i] += a * value;
+                right[i] += weight * a * value;
                 for (j, &b) in row[..=i].iter().enumerate() {
-                    normal[(i, j)] += a * b;
+                    normal[(i, j)] += weight * a * b;
                 }
             }
-            sum_squares += value * value;
+            sum_squares += weight * value * value;
             rows += 1;
+        }
+        // Levels that are missing are left out; so are rows before the first value.
+        if !increments || value.is_finite() || !last.is_finite() {
+            row.fill(0.0);
+            since = 0;
+            if increments {
+                last = level;
+            }
         }
         for (r, s) in rotors.iter_mut().zip(&steps) {
             *r *= s;
@@ -240,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_without_a_bead_are_left_out() {
+    fn over_rows_without_a_bead_there_is_one_increment() {
         let truth = [(5.0, Complex::new(0.7, 0.1))];
         let mut signal = record(1000, &truth, -3.0);
         for k in (0..1000).step_by(37) {
@@ -248,8 +263,8 @@ mod tests {
         }
         let block = fit_block(&signal, 0, 1000, 1e-3, &[5.0], ToneFit::default()).unwrap();
         assert!((block.phasors[0] - truth[0].1).norm() < 1e-9);
-        // 999 increments; 26 missing rows inside take two each, the first and the last row one each.
-        assert_eq!(block.rows, 999 - 2 * 26 - 2);
+        // 999 increments; of those about a missing row inside, two become one, and the first and the last row have one each.
+        assert_eq!(block.rows, 999 - 26 - 2);
     }
 
     #[test]

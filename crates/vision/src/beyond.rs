@@ -5,11 +5,12 @@
 //! it is off its own centre. Both are nuisance parameters, and a window that does not need them would lose certainty by
 //! them: they are fitted where a score test finds them.
 
-use crate::crop::{Crop, LANES, STRIDE};
+use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::{Image, Pass, Weights};
 use crate::streak::Comb;
 use crate::template::Template;
 use nalgebra::{SMatrix, SVector};
+use wide::f32x4;
 
 /// Smallest and largest size that another focus or a blur makes of a bead. A blur of half the radius makes a Gaussian larger by the root
 /// of two. Farther off the rest of the picture has changed, too, and beads of other sizes are others.
@@ -19,7 +20,7 @@ const LEAST_EXPLAINED: f64 = 0.3;
 /// Steps of the fit, and when it is at rest: place in px, size as a fraction.
 const MOST_STEPS: usize = 4;
 const AT_REST: (f64, f64) = (0.01, 0.005);
-/// Parameters: x, y, contrast, level, slopes of the light along row and column, size.
+/// Parameters: x, y, contrast, level, slope of the light along the row, size, slope down the column.
 const ALL: usize = 7;
 
 const NONE: Asked = Asked {
@@ -100,13 +101,17 @@ fn pass(
         (y_px - crop.y0 as f64) as f32,
     );
     let (u0, v0) = middle(crop);
-    let lanes_end = crop.width.next_multiple_of(LANES).min(STRIDE);
+    let lanes_end = crop.lanes_end();
     let mut image = Image::new(lanes_end);
     let mut weight = weights.of_even(crop);
-    let with_size = asked.size && comb.is_still();
+    let with_size = f32::from(u8::from(asked.size && comb.is_still()));
     let slopes = f32::from(u8::from(asked.slopes));
-    // The lower triangle, row by row, the right side, and the pixels' square.
-    let (mut normal, mut right, mut square) = ([[0.0_f64; ALL]; ALL], [0.0_f64; ALL], 0.0_f64);
+    // Along the row: what a slope adds, and the distance from the bead for the size; nothing of what is not asked for.
+    let (mut across, mut away): (Row, Row) = ([0.0; STRIDE], [0.0; STRIDE]);
+    for (i, (u, dx)) in across.iter_mut().zip(&mut away).enumerate() {
+        (*u, *dx) = (slopes * (i as f32 - u0), with_size * (i as f32 - x));
+    }
+    let mut sums = Sums::default();
     for (j, pixels) in crop.rows.iter().enumerate().take(crop.height) {
         let dy = j as f32 - y;
         image.draw_row(template, comb, x, dy);
@@ -115,68 +120,100 @@ fn pass(
         for column in crop.left_out(j) {
             with_holes[column.min(STRIDE - 1)] = 0.0;
         }
-        let (mut row, mut row_right, mut row_square) =
-            ([[0.0_f32; ALL]; ALL], [0.0_f32; ALL], 0.0_f32);
-        let parts = pixels.iter().zip(&with_holes).zip(&image.value);
-        let parts = parts
-            .zip(image.by_x.iter().zip(&image.by_y))
-            .take(crop.width);
-        for (i, (((p, w), f), (fx, fy))) in parts.enumerate() {
-            let size = if with_size {
-                (i as f32 - x) * fx + dy * fy
-            } else {
-                0.0
+        let mut row = RowSums::default();
+        let dy = f32x4::splat(with_size * dy);
+        for k in (0..lanes_end).step_by(LANES) {
+            let four = |from: &Row| {
+                f32x4::from(<[f32; LANES]>::try_from(&from[k..k + LANES]).unwrap_or_default())
             };
-            let g = [
-                *fx,
-                *fy,
-                *f,
-                1.0,
-                slopes * (i as f32 - u0),
-                slopes * (j as f32 - v0),
-                size,
-            ];
-            for a in 0..ALL {
-                let wg = w * g[a];
-                for b in 0..=a {
-                    row[a][b] += wg * g[b];
-                }
-                row_right[a] += wg * p;
-            }
-            row_square += w * p * p;
+            let (fx, fy) = (four(&image.by_x), four(&image.by_y));
+            let size = four(&away) * fx + dy * fy;
+            let g = [fx, fy, four(&image.value), f32x4::ONE, four(&across), size];
+            row.add(four(&with_holes), g, four(pixels));
         }
-        for a in 0..ALL {
+        sums.take_row(&row, slopes * (j as f32 - v0));
+    }
+    sums.solve()
+}
+
+/// Parameters whose derivative changes along a row: all but the slope down the column, which is a row's own.
+const ALONG: usize = ALL - 1;
+/// The level among them: its products are the sums of the others.
+const LEVEL: usize = 3;
+
+/// Sums over a row, lane by lane: the lower triangle of the normal matrix, the right side, and the pixels' square.
+#[derive(Default)]
+struct RowSums {
+    normal: [[f32x4; ALONG]; ALONG],
+    right: [f32x4; ALONG],
+    square: f32x4,
+}
+
+impl RowSums {
+    #[inline(always)]
+    fn add(&mut self, w: f32x4, g: [f32x4; ALONG], p: f32x4) {
+        for (a, (row, right)) in self.normal.iter_mut().zip(&mut self.right).enumerate() {
+            let wg = w * g[a];
+            for (sum, g) in row.iter_mut().zip(&g).take(a + 1) {
+                *sum += wg * *g;
+            }
+            *right += wg * p;
+        }
+        self.square += w * p * p;
+    }
+}
+
+/// Sums over the window, in the order x, y, contrast, level, slope along the row, size, slope down the column.
+#[derive(Default)]
+struct Sums {
+    normal: [[f64; ALL]; ALL],
+    right: [f64; ALL],
+    square: f64,
+}
+
+impl Sums {
+    /// A row in which the slope down the column adds `v`.
+    fn take_row(&mut self, row: &RowSums, v: f32) {
+        let (v, t) = (f64::from(v), |lanes: f32x4| f64::from(lanes.reduce_add()));
+        for a in 0..ALONG {
             for b in 0..=a {
-                normal[a][b] += f64::from(row[a][b]);
+                self.normal[a][b] += t(row.normal[a][b]);
             }
-            right[a] += f64::from(row_right[a]);
+            self.normal[ALONG][a] += v * t(row.normal[a.max(LEVEL)][a.min(LEVEL)]);
+            self.right[a] += t(row.right[a]);
         }
-        square += f64::from(row_square);
+        self.normal[ALONG][ALONG] += v * v * t(row.normal[LEVEL][LEVEL]);
+        self.right[ALONG] += v * t(row.right[LEVEL]);
+        self.square += t(row.square);
     }
-    let mut matrix = SMatrix::<f64, ALL, ALL>::from_fn(|a, b| normal[a.max(b)][a.min(b)]);
-    for k in 4..ALL {
-        // A column that is not asked for.
-        if matrix[(k, k)] == 0.0 {
-            matrix[(k, k)] = 1.0;
+
+    fn solve(&self) -> Option<(Pass, (f64, f64), f64)> {
+        let mut matrix = SMatrix::<f64, ALL, ALL>::from_fn(|a, b| self.normal[a.max(b)][a.min(b)]);
+        for k in LEVEL + 1..ALL {
+            // A column that is not asked for.
+            if matrix[(k, k)] == 0.0 {
+                matrix[(k, k)] = 1.0;
+            }
         }
+        let right = SVector::<f64, ALL>::from(self.right);
+        let inverse = matrix.cholesky()?.inverse();
+        let solution = inverse * right;
+        let amplitude = solution[2];
+        let pass = Pass {
+            step_x_px: solution[0] / amplitude,
+            step_y_px: solution[1] / amplitude,
+            amplitude,
+            amplitude_variance: inverse[(2, 2)],
+            // At the middle of the window.
+            background: solution[LEVEL],
+            chi2: self.square - solution.dot(&right),
+            covariance: inverse.fixed_view::<2, 2>(0, 0) / (amplitude * amplitude),
+        };
+        let size = solution[5] / amplitude;
+        let finite =
+            pass.step_x_px.is_finite() && pass.step_y_px.is_finite() && pass.chi2.is_finite();
+        (finite && size.is_finite()).then_some((pass, (solution[4], solution[6]), size))
     }
-    let right = SVector::<f64, ALL>::from(right);
-    let inverse = matrix.cholesky()?.inverse();
-    let solution = inverse * right;
-    let amplitude = solution[2];
-    let pass = Pass {
-        step_x_px: solution[0] / amplitude,
-        step_y_px: solution[1] / amplitude,
-        amplitude,
-        amplitude_variance: inverse[(2, 2)],
-        // At the middle of the window.
-        background: solution[3],
-        chi2: square - solution.dot(&right),
-        covariance: inverse.fixed_view::<2, 2>(0, 0) / (amplitude * amplitude),
-    };
-    let size = solution[6] / amplitude;
-    let finite = pass.step_x_px.is_finite() && pass.step_y_px.is_finite() && pass.chi2.is_finite();
-    (finite && size.is_finite()).then_some((pass, (solution[4], solution[5]), size))
 }
 
 /// Middle of a window.

@@ -196,7 +196,7 @@ impl Residues {
                 let weight = fx * fx + fy * fy;
                 sum += weight * r * r;
                 weights += weight;
-                let away = f32::hypot(dx, dy).max(0.5);
+                let away = (dx * dx + dy * dy).sqrt().max(0.5);
                 let k = (away as usize).min(RINGS - 2);
                 // The derivative by the centre is the opposite of that by the place.
                 let slope = self.rings[k] - self.rings[k + 1];
@@ -366,8 +366,11 @@ fn take_off_radial_mean(
     sums: &mut [f32; RINGS],
 ) {
     let place = |i: usize, j: usize| {
-        let u = f32::hypot(i as f32 - x, j as f32 - y);
-        (u as usize, u.fract())
+        // Neither `hypot` nor `fract`: both are calls of a library.
+        let (dx, dy) = (i as f32 - x, j as f32 - y);
+        let u = (dx * dx + dy * dy).sqrt();
+        let whole = u as usize;
+        (whole, u - whole as f32)
     };
     *sums = [0.0; RINGS];
     let mut weights = [0.0_f32; RINGS];

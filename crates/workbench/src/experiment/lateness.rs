@@ -50,7 +50,7 @@ pub(crate) fn lateness_ns(ticks: &[TickRecord], period_ns: i64) -> Vec<Option<i6
 
 /// Upper limit of the delay from a command to its effect, in periods: at 1 kHz over USB or a serial line, with the lateness of a tick
 /// included.
-pub(crate) const LINE_PERIODS: f64 = 1.0;
+const LINE_PERIODS: f64 = 1.0;
 
 /// A bead that goes with the speed of the command, some time later.
 #[derive(Debug, Clone, Copy)]

@@ -2,8 +2,7 @@
 
 use crate::experiment::exciting::SETTLE_TICKS;
 use crate::experiment::lateness::{
-    HandedOver, LINE_PERIODS, age_ns, as_if_on_time, is_new_frame, lateness_ns, median,
-    with_new_frame,
+    HandedOver, age_ns, as_if_on_time, is_new_frame, lateness_ns, median, with_new_frame,
 };
 use cellpos_ident::experiment::{RecordedSegment, Span};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
@@ -52,8 +51,6 @@ pub(crate) struct Rows {
     /// Position of each row, um, as if all commands had been on time; NaN without one.
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
-    /// There was no tick at this row: the command before it was held.
-    skipped: Vec<bool>,
     /// The command of this row's tick came too late to stand as if on time, or never.
     late: Vec<bool>,
     /// The frame came too late, or without a reliable bead.
@@ -92,7 +89,6 @@ impl Rows {
             input: Vec::new(),
             output: Vec::new(),
             usable: Vec::new(),
-            skipped: Vec::new(),
             late: Vec::new(),
             unseen: Vec::new(),
             without_bead: Vec::new(),
@@ -115,30 +111,31 @@ impl Rows {
             let has = |flag| tick.flags.has(flag);
             let new_frame = is_new_frame(tick);
             let next = rows.input.len();
-            let row = if new_frame {
+            let exposed = if new_frame {
                 let first = *first_id.get_or_insert(tick.frame_id.saturating_sub(next as u64));
                 usize::try_from(tick.frame_id.saturating_sub(first)).unwrap_or(next)
             } else {
                 next
             };
-            // A late frame overwrites the row that a timer tick has already taken.
-            let row = row.clamp(next.saturating_sub(1), next + 10_000);
+            // A late frame overwrites the command of a timer tick that has already taken its row.
+            let row = exposed.clamp(next.saturating_sub(1), next + 10_000);
+            // A row without a tick has the command that lies between those about it. The positions are made to go with it.
+            let (begin, before_um) = (next, rows.input.last().copied());
             while rows.input.len() <= row {
-                let held_um = rows.input.last().copied().unwrap_or(tick.command_um);
-                rows.input.push(held_um);
+                let part = (rows.input.len() + 1 - begin) as f64 / (row + 1 - begin) as f64;
+                let before_um = before_um.unwrap_or(tick.command_um);
+                rows.input
+                    .push(before_um + part * (tick.command_um - before_um));
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
-                rows.skipped.push(true);
                 rows.late.push(true);
                 rows.unseen.push(false);
                 rows.without_bead.push(false);
                 rows.ages_ns.push(None);
             }
             let age_ns = age_ns(tick);
-            // A frame half a period off the usual age belongs to another row.
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
-            rows.skipped[row] = false;
             handed_over.extend(late_ns.map(|ns| HandedOver {
                 row: row as f64 + ns as f64 / period_ns as f64,
                 um: tick.command_um,
@@ -149,7 +146,10 @@ impl Rows {
             // The row's command stands as if on time.
             rows.ages_ns[row] = late_ns.filter(|_| on_time).map(|late_ns| age_ns - late_ns);
             rows.input[row] = tick.command_um;
-            rows.output[row] = if on_time { tick.measured_um } else { f64::NAN };
+            // A frame shows the bead when it was exposed, however late it came.
+            if let Some(output) = rows.output.get_mut(exposed).filter(|_| new_frame) {
+                *output = tick.measured_um;
+            }
             rows.unseen[row] = is_unseen(tick);
             rows.without_bead[row] = is_unseen(tick);
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
@@ -213,21 +213,10 @@ impl Rows {
                 });
             }
         }
-        let (mut input, mut output) = (self.input[start..end].to_vec(), output.to_vec());
-        for row in (start..end).filter(|&row| self.late[row]) {
-            if self.skipped[row] {
-                input[row - start] = f64::NAN;
-            }
-            for shown in self
-                .acts_at(row)
-                .filter(|shown| (start..end).contains(shown))
-            {
-                output[shown - start] = f64::NAN;
-            }
-        }
+        let (input, output) = (self.input[start..end].to_vec(), output.to_vec());
         let steps = output[from - start..].windows(2);
-        let shown = (steps.clone())
-            .filter(|pair| pair.iter().all(|um| um.is_finite()))
+        let shown = (steps.clone().zip(&self.late[from..]))
+            .filter(|(pair, late)| !**late && pair.iter().all(|um| um.is_finite()))
             .count();
         // The fit leaves out a block that lost half of its steps: with five eighths of all, a quarter of the blocks remain at least.
         if 8 * shown < 5 * steps.len() {
@@ -242,13 +231,6 @@ impl Rows {
             input,
             output,
         })
-    }
-
-    /// The rows whose positions first show the command of `row`. Without these rows no increment of the record contains the moment at
-    /// which the command acted; later rows show only its result.
-    fn acts_at(&self, row: usize) -> std::ops::RangeInclusive<usize> {
-        let age = self.usual_age_periods;
-        row + age.floor() as usize + 1..=row + (age + LINE_PERIODS).floor() as usize + 1
     }
 }
 

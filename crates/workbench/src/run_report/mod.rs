@@ -5,6 +5,7 @@ mod clips;
 mod compare;
 mod course;
 mod cycles;
+mod disturbed;
 mod envelope;
 mod error_figure;
 mod fatigue;

@@ -2,6 +2,7 @@
 
 use super::Session;
 use super::bound::Bound;
+use super::disturbed;
 use super::error_figure::{mean, motions};
 use super::origin;
 use super::ticks::Ticks;
@@ -16,6 +17,8 @@ const LEARNED: f64 = 0.3;
 pub(super) struct Said {
     pub(super) result: String,
     sure: String,
+    /// Why the numbers may be wrong.
+    doubt: Option<String>,
 }
 
 /// Adds the sentences, and the figure unless the cycles of a cell have one; returns the result's.
@@ -34,6 +37,7 @@ pub(super) fn section(
     let Said {
         mut result,
         mut sure,
+        doubt,
     } = of_a_cell(rows)
         .or_else(|| of_waves(rows, bound, what))
         .or_else(|| of_cycles(rows, bound, what))
@@ -41,7 +45,19 @@ pub(super) fn section(
         .unwrap_or_else(|| Said {
             result: "The loop was not closed long enough for an error to be stated.".to_string(),
             sure: "no error was measured. What happened is in the record, and below.".to_string(),
+            doubt: None,
         });
+    let status = match (status, doubt) {
+        (status, None) => status,
+        (status, Some(doubt)) => {
+            result.push_str(&format!(" {doubt}"));
+            if status == Emphasis::Good {
+                Emphasis::Warning
+            } else {
+                status
+            }
+        }
+    };
     // How it ended comes first: the error is then that of a part.
     if let Some(ended) = ended {
         result.insert_str(0, &format!("The run did not end as planned: {ended}. "));
@@ -146,7 +162,7 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
         change(&stretch),
         percent(&stretch),
         stretch.cycles,
-        disturbed(rows.iter().filter(super::fatigue::is_whole)),
+        disturbed::counted(rows.iter().filter(super::fatigue::is_whole)),
         stretch.first.cycles
     );
     if let Some(recovery) = cyclic(rows, |row| row.recovery_s) {
@@ -171,7 +187,12 @@ fn of_a_cell(rows: &[CycleRow]) -> Option<Said> {
     );
     sure.push_str(&sure_of_rest(&rest));
     sure.push_str(" One cell does not tell how cells differ.");
-    Some(Said { result: text, sure })
+    let doubt = of_stretch_in_doubt(rows, &rest);
+    Some(Said {
+        result: text,
+        sure,
+        doubt,
+    })
 }
 
 /// The length at rest with its 95 % interval, um.
@@ -214,10 +235,19 @@ fn of_few_cycles(rows: &[CycleRow], rest: &AtRest) -> Option<Said> {
             "The cell's stretch (largest length over the {} um at rest) was {first:.3} in the first and {last:.3} in the last of {} cycles{}.",
             at_rest(rest),
             stretches.len(),
-            disturbed(rows.iter().filter(super::fatigue::is_whole))
+            disturbed::counted(rows.iter().filter(super::fatigue::is_whole))
         ),
         sure: format!("so few cycles have no interval.{}", sure_of_rest(rest)),
+        doubt: of_stretch_in_doubt(rows, rest),
     })
+}
+
+/// Whether disturbed cycles put the stretch in doubt.
+fn of_stretch_in_doubt(rows: &[CycleRow], rest: &AtRest) -> Option<String> {
+    let counted = rows.iter().filter(super::fatigue::is_whole);
+    let counted =
+        counted.filter(|row| row.arm == ArmKind::Cyclic && !super::cycles::was_elsewhere(row));
+    disturbed::doubt("the stretch", counted, |row| rest.stretch(row))
 }
 
 /// RMS error over cycles with half its 95 % interval, nm.
@@ -284,28 +314,25 @@ fn of_waves(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said
             && !super::cycles::was_elsewhere(row)
             && (row.reached_um / row.commanded_um).is_finite()
     };
-    let but = disturbed(rows.iter().filter(counted));
+    let but = disturbed::counted(rows.iter().filter(counted));
     Some(Said {
         result: format!(
             "{shares} (means of {cycles} cycles{but}). Error: {error} nm RMS{}.",
             possible(bound)
         ),
         sure: sure_of_cycles(bound),
+        doubt: disturbed::doubt(
+            "the share of the amplitude that was reached",
+            rows.iter().filter(counted),
+            |row| row.reached_um / row.commanded_um,
+        ),
     })
-}
-
-/// How many of these cycles were disturbed: frames or the object were missing, so their lengths and errors may be wrong.
-fn disturbed<'a>(rows: impl Iterator<Item = &'a CycleRow>) -> String {
-    match rows.filter(|row| row.flags.is_disturbed()).count() {
-        0 => String::new(),
-        n => format!(", {n} of them disturbed"),
-    }
 }
 
 /// A bead over the cycles of a script. Its steps count, which the error of a hold leaves out.
 fn of_cycles(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Said> {
     let error = over_cycles(rows)?;
-    let but = disturbed(rows.iter());
+    let but = disturbed::counted(rows.iter());
     let cycles = if rows.len() == 1 { "cycle" } else { "cycles" };
     Some(Said {
         result: format!(
@@ -314,6 +341,9 @@ fn of_cycles(rows: &[CycleRow], bound: Option<&Bound>, what: &str) -> Option<Sai
             possible(bound)
         ),
         sure: sure_of_cycles(bound),
+        doubt: disturbed::doubt("the mean of the cycles' errors in nm", rows.iter(), |row| {
+            1e3 * row.rms_um
+        }),
     })
 }
 
@@ -355,7 +385,11 @@ fn of_a_hold(ticks: &Ticks, bound: Option<&Bound>, what: &str, kept: bool) -> Op
         "{of_interval}The error is that of the measured position{noise}, from two seconds after the loop was closed.{}",
         bound.map_or_else(String::new, of_bound)
     );
-    Some(Said { result, sure })
+    Some(Said {
+        result,
+        sure,
+        doubt: None,
+    })
 }
 
 fn nm(um: f64) -> String {
