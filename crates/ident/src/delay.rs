@@ -73,6 +73,52 @@ pub fn dithered_edges(
         .collect()
 }
 
+/// The edges of a test, and the delay that they tell.
+///
+/// A light that changes while the shutter is open shows in part of that frame's brightness. If too few frames are between dark and lit,
+/// the frames show the light at one instant of their exposure, as the pictures of a simulated camera may, and nobody knows at which: the
+/// delay is that to the middle, and half of the exposure is not accounted for.
+///
+/// # Errors
+/// [`IdentError::EdgesNotSeen`] when fewer than half the edges show, [`IdentError::TooShort`] below four, [`IdentError::Lengths`].
+pub fn delay_test(
+    sent_s: &[f64],
+    frames: Brightness,
+) -> Result<(Vec<SeenEdge>, DelayEstimate), IdentError> {
+    let edges = find_edges(sent_s, frames)?;
+    if !frames.show_instants(&edges) {
+        let estimate = delay_from_edges(&edges)?;
+        return Ok((edges, estimate));
+    }
+    let edges = find_edges(
+        sent_s,
+        Brightness {
+            exposure_s: 0.0,
+            ..frames
+        },
+    )?;
+    let estimate = DelayEstimate {
+        not_accounted_s: 0.5 * frames.exposure_s,
+        ..delay_from_edges(&edges)?
+    };
+    Ok((edges, estimate))
+}
+
+impl Brightness<'_> {
+    /// Whether far fewer of the edges than fell into an exposure show in a part of it.
+    fn show_instants(&self, edges: &[SeenEdge]) -> bool {
+        let [Some(first), Some(last)] = [self.mid_s.first(), self.mid_s.last()] else {
+            return false;
+        };
+        let period_s = (last - first) / (self.mid_s.len() as f64 - 1.0);
+        let timed = edges.iter().filter(|e| e.before_s == e.after_s).count();
+        let told = 1.0 - 2.0 * Levels::of_all(self.grey).doubt;
+        let fell = edges.len() as f64 * (self.exposure_s / period_s).min(1.0) * told;
+        // A quarter of so many is five standard deviations from all.
+        fell >= 4.0 * ENOUGH_TIMES as f64 && 4.0 * (timed as f64) < fell
+    }
+}
+
 /// Finds each edge in a brightness record. Edges in `sent_s` alternate, and the first one rises.
 ///
 /// # Errors
@@ -89,10 +135,7 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
             output: grey.len(),
         });
     }
-    let low = grey.iter().copied().fold(f64::INFINITY, f64::min);
-    let high = grey.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let threshold = 0.5 * (low + high);
-    let levels = Levels::of(grey, threshold);
+    let levels = Levels::of_all(grey);
     let mut seen = Vec::with_capacity(sent_s.len());
     for (i, &sent) in sent_s.iter().enumerate() {
         let rising = i % 2 == 0;
@@ -130,7 +173,7 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
         return Err(IdentError::EdgesNotSeen {
             seen: seen.len(),
             sent: sent_s.len(),
-            threshold,
+            threshold: Levels::threshold(grey),
         });
     }
     Ok(seen)
@@ -145,6 +188,16 @@ struct Levels {
 }
 
 impl Levels {
+    fn threshold(grey: &[f64]) -> f64 {
+        let low = grey.iter().copied().fold(f64::INFINITY, f64::min);
+        let high = grey.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        0.5 * (low + high)
+    }
+
+    fn of_all(grey: &[f64]) -> Self {
+        Self::of(grey, Self::threshold(grey))
+    }
+
     fn of(grey: &[f64], threshold: f64) -> Self {
         let side = |above: bool| {
             let mut side: Vec<f64> = grey
@@ -359,6 +412,32 @@ mod tests {
                 }
             }
             assert!(covered >= 54, "{exposure_s}: {covered} of 60");
+        }
+    }
+
+    #[test]
+    fn frames_that_show_the_light_at_one_instant_leave_half_of_the_exposure_open() {
+        let sent = dithered_edges(300, 0.011, 1e-3, 0.01, 3);
+        let (exposure_s, delay_s) = (5e-4, 0.0018);
+        for (instant_s, is_open) in [(Some(2.5e-4), true), (Some(-2.5e-4), true), (None, false)] {
+            let (mid_s, grey) = match instant_s {
+                Some(at_s) => test_record(&sent, 0.0, |_| delay_s - at_s),
+                None => test_record(&sent, exposure_s, |_| delay_s),
+            };
+            let frames = Brightness {
+                mid_s: &mid_s,
+                exposure_s,
+                grey: &grey,
+            };
+            let (_, found) = delay_test(&sent, frames).unwrap();
+            let open_s = if is_open { 2.5e-4 } else { 0.0 };
+            assert_eq!(found.not_accounted_s, open_s, "{instant_s:?}: {found:?}");
+            let [low, high] = found.ci95_s;
+            assert!(
+                (low - open_s..=high + open_s).contains(&delay_s),
+                "{instant_s:?}: {found:?}"
+            );
+            assert!(high - low < 5e-5, "{instant_s:?}: {found:?}");
         }
     }
 

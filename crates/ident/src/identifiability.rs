@@ -278,8 +278,9 @@ fn contradiction_s(
         .map(|lead| (effective + lead) * 1e-3)
     };
     let given = |times: f64| [-1.0, 1.0].map(|side| prior.delay_s + side * times * prior.half95_s);
-    apart_s(given(SURE), phase(SURE), NOT_ACCOUNTED_S)?;
-    apart_s(given(1.0), phase(1.0), NOT_ACCOUNTED_S)
+    let tolerated_s = prior.not_accounted_s.max(NOT_ACCOUNTED_S);
+    apart_s(given(SURE), phase(SURE), tolerated_s)?;
+    apart_s(given(1.0), phase(1.0), tolerated_s)
 }
 
 /// A delay whose two measurements contradict each other by `gap_s`: its interval holds both, and it is not identified.

@@ -94,7 +94,8 @@ pub fn summarise(
     let selection = problem.fit()?;
     let prior = led.map(|l| DelayPrior {
         delay_s: l.delay_s,
-        sd_s: l.sd_s.max(1e-7),
+        // What is not accounted for may be anything within its bounds.
+        sd_s: l.sd_s.hypot(l.not_accounted_s / 3f64.sqrt()).max(1e-7),
         half95_s: (0.5 * (l.ci95_s[1] - l.ci95_s[0])).max(1e-7),
         not_accounted_s: l.not_accounted_s,
     });
