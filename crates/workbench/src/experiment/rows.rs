@@ -119,13 +119,11 @@ impl Rows {
             };
             // A late frame overwrites the command of a timer tick that has already taken its row.
             let row = exposed.clamp(next.saturating_sub(1), next + 10_000);
-            // A row without a tick has the command that lies between those about it. The positions are made to go with it.
-            let (begin, before_um) = (next, rows.input.last().copied());
+            // In a row without a tick the command before it was held. What lies between it and the next would foretell that one, which answers
+            // the noise of these rows.
             while rows.input.len() <= row {
-                let part = (rows.input.len() + 1 - begin) as f64 / (row + 1 - begin) as f64;
-                let before_um = before_um.unwrap_or(tick.command_um);
-                rows.input
-                    .push(before_um + part * (tick.command_um - before_um));
+                let held_um = rows.input.last().copied().unwrap_or(tick.command_um);
+                rows.input.push(held_um);
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
                 rows.late.push(true);
@@ -146,11 +144,12 @@ impl Rows {
             // The row's command stands as if on time.
             rows.ages_ns[row] = late_ns.filter(|_| on_time).map(|late_ns| age_ns - late_ns);
             rows.input[row] = tick.command_um;
-            // A frame shows the bead when it was exposed, however late it came.
-            if let Some(output) = rows.output.get_mut(exposed).filter(|_| new_frame) {
+            // A frame shows the bead when it was exposed. One that came half a period late came in a stall, and when the board had the
+            // commands of a stall nobody here knows.
+            if let Some(output) = rows.output.get_mut(exposed).filter(|_| on_time) {
                 *output = tick.measured_um;
             }
-            rows.unseen[row] = is_unseen(tick);
+            rows.unseen[row] = is_unseen(tick) || new_frame && !on_time;
             rows.without_bead[row] = is_unseen(tick);
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
             rows.usable[row] = tick.is_controlled();
