@@ -76,8 +76,8 @@ pub fn dithered_edges(
 /// The edges of a test, and the delay that they tell.
 ///
 /// A light that changes while the shutter is open shows in part of that frame's brightness. If too few frames are between dark and lit,
-/// the frames show the light at one instant of their exposure, as the pictures of a simulated camera may, and nobody knows at which: the
-/// delay is that to the middle, and half of the exposure is not accounted for.
+/// the frames show the light at one instant of their exposure, as the pictures of a simulated camera may. Nobody knows at which instant:
+/// the delay is that to the middle, and half of the exposure is not accounted for.
 ///
 /// # Errors
 /// [`IdentError::EdgesNotSeen`] when fewer than half the edges show, [`IdentError::TooShort`] below four, [`IdentError::Lengths`].
@@ -105,16 +105,16 @@ pub fn delay_test(
 }
 
 impl Brightness<'_> {
-    /// Whether far fewer of the edges than fell into an exposure show in a part of it.
+    /// Whether far fewer edges show in a part of an exposure than fell into one.
     fn show_instants(&self, edges: &[SeenEdge]) -> bool {
         let [Some(first), Some(last)] = [self.mid_s.first(), self.mid_s.last()] else {
             return false;
         };
         let period_s = (last - first) / (self.mid_s.len() as f64 - 1.0);
         let timed = edges.iter().filter(|e| e.before_s == e.after_s).count();
-        let told = 1.0 - 2.0 * Levels::of_all(self.grey).doubt;
+        let told = 1.0 - 2.0 * Levels::of(self.grey).doubt;
         let fell = edges.len() as f64 * (self.exposure_s / period_s).min(1.0) * told;
-        // A quarter of so many is five standard deviations from all.
+        // From 48 edges on, a quarter is five standard deviations below all.
         fell >= 4.0 * ENOUGH_TIMES as f64 && 4.0 * (timed as f64) < fell
     }
 }
@@ -135,7 +135,7 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
             output: grey.len(),
         });
     }
-    let levels = Levels::of_all(grey);
+    let levels = Levels::of(grey);
     let mut seen = Vec::with_capacity(sent_s.len());
     for (i, &sent) in sent_s.iter().enumerate() {
         let rising = i % 2 == 0;
@@ -173,7 +173,7 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
         return Err(IdentError::EdgesNotSeen {
             seen: seen.len(),
             sent: sent_s.len(),
-            threshold: Levels::threshold(grey),
+            threshold: levels.threshold,
         });
     }
     Ok(seen)
@@ -181,6 +181,8 @@ pub fn find_edges(sent_s: &[f64], frames: Brightness) -> Result<Vec<SeenEdge>, I
 
 /// Grey levels of the light off and on.
 struct Levels {
+    /// Between both.
+    threshold: f64,
     dark: f64,
     lit: f64,
     /// Share of the light that noise can imitate.
@@ -188,17 +190,10 @@ struct Levels {
 }
 
 impl Levels {
-    fn threshold(grey: &[f64]) -> f64 {
+    fn of(grey: &[f64]) -> Self {
         let low = grey.iter().copied().fold(f64::INFINITY, f64::min);
         let high = grey.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        0.5 * (low + high)
-    }
-
-    fn of_all(grey: &[f64]) -> Self {
-        Self::of(grey, Self::threshold(grey))
-    }
-
-    fn of(grey: &[f64], threshold: f64) -> Self {
+        let threshold = 0.5 * (low + high);
         let side = |above: bool| {
             let mut side: Vec<f64> = grey
                 .iter()
@@ -219,7 +214,12 @@ impl Levels {
         let swing = (lit - dark).max(f64::MIN_POSITIVE);
         // Five standard deviations: about one frame in a million is mistaken. A share below 1 % of an exposure adds nothing.
         let doubt = (5.0 * dark_sd.max(lit_sd) / swing).clamp(0.01, 0.45);
-        Self { dark, lit, doubt }
+        Self {
+            threshold,
+            dark,
+            lit,
+            doubt,
+        }
     }
 
     /// Part of the exposure for which the light was on, 0 to 1.

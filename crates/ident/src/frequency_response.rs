@@ -279,10 +279,11 @@ fn borders(segment: &DrivenStretch<'_>, settings: &Settings, all_hz: &[f64]) -> 
     )
 }
 
-/// Replaces response and scatter of `points`, the driven lines of `segment`, by what `rest` adds to the response of a plant, and by its
-/// scatter: the rest is the output less the response of that plant to the input, and `of_plant` is that response at a frequency. What a
-/// block's input began before the block, and what it leaves to the next, is then neither scatter nor bias; nor is what an input that
-/// answers the output did while rows were missing from the output.
+/// Measures `points`, the driven lines of `segment`, by its `rest`: the output less the response of a plant to the input. Each response is
+/// that of the plant, `of_plant` at a frequency, and the part that the rest adds; its scatter is the rest's.
+///
+/// A motion that a block's input began before the block, or leaves to the next, is then neither scatter nor bias. An input that answers
+/// the output does not bias it either where rows are missing from the output.
 pub(crate) fn measure_by_rest(
     points: &mut [FrequencyPoint],
     segment: &DrivenStretch<'_>,

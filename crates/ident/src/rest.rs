@@ -76,17 +76,9 @@ impl Rest {
         later_s: f64,
         sampling: Sampling,
     ) -> Self {
-        // In a row without a tick the command before it was held.
-        let first_um = segment.input.iter().find(|um| um.is_finite());
-        let held_um = segment
-            .input
-            .iter()
-            .scan(first_um.copied().unwrap_or(0.0), |held_um, um| {
-                *held_um = if um.is_finite() { *um } else { *held_um };
-                Some(*held_um)
-            });
-        let held_um: Vec<f64> = held_um.collect();
-        let shown = later(model, later_s).sampler(sampling).record(&held_um);
+        let shown = later(model, later_s)
+            .sampler(sampling)
+            .record(segment.input);
         let changes = shown[segment.from..].windows(3);
         let count = changes.len().max(1) as f64;
         let change = |w: &[f64]| ((w[2] - 2.0 * w[1] + w[0]) / segment.period_s).powi(2);

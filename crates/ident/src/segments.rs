@@ -46,7 +46,7 @@ pub struct RecordedSegment {
     pub from: usize,
     /// Mean time from the middle of an exposure to the tick that used it, s, by the frames' own stamps; `None`: not known.
     pub age_s: Option<f64>,
-    /// Commanded displacement per row, um; `NaN` in a row without a tick.
+    /// Commanded displacement per row, um; in a row without a tick the command before it, which was held.
     pub input: Vec<f64>,
     /// Bead position per row, um; `NaN` in a row without one.
     pub output: Vec<f64>,

@@ -3,8 +3,8 @@
 //! A bare FFT puts `v/(pi f)` of a drift `v` into every bin, whatever the record's length; here the drift has separate regressors. The
 //! noise of a freely diffusing bead is a random walk, so its increments are white, and least squares on them is the best linear estimate.
 //! The fit uses increments and converts the phasors back exactly (`Y = dY/(1 - e^(-jw))`). Over rows without a bead (`NaN`) one longer
-//! increment is fitted: what the bead did there would otherwise be missing from the output and not from the input, and a loop that goes
-//! without a position commands something else. Not for records whose input is not periodic.
+//! increment is fitted. Otherwise the bead's motion there would be missing from the output and not from the input, and a loop without a
+//! position gives other commands. Not for records whose input is not periodic.
 
 use nalgebra::{Complex, DMatrix, DVector};
 
@@ -263,7 +263,7 @@ mod tests {
         }
         let block = fit_block(&signal, 0, 1000, 1e-3, &[5.0], ToneFit::default()).unwrap();
         assert!((block.phasors[0] - truth[0].1).norm() < 1e-9);
-        // 999 increments; of those about a missing row inside, two become one, and the first and the last row have one each.
+        // 999 increments; the two about each missing row inside become one, and those at the first and the last row are lost.
         assert_eq!(block.rows, 999 - 26 - 2);
     }
 

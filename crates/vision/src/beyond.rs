@@ -106,7 +106,7 @@ fn pass(
     let mut weight = weights.of_even(crop);
     let with_size = f32::from(u8::from(asked.size && comb.is_still()));
     let slopes = f32::from(u8::from(asked.slopes));
-    // Along the row: what a slope adds, and the distance from the bead for the size; nothing of what is not asked for.
+    // Along the row: derivative by the slope, and distance from the bead for the size. A parameter that is not asked for has zeros.
     let (mut across, mut away): (Row, Row) = ([0.0; STRIDE], [0.0; STRIDE]);
     for (i, (u, dx)) in across.iter_mut().zip(&mut away).enumerate() {
         (*u, *dx) = (slopes * (i as f32 - u0), with_size * (i as f32 - x));

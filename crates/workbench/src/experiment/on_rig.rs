@@ -15,6 +15,7 @@ use cellpos_ident::delay::dithered_edges;
 use cellpos_ident::excitation::ExcitationLimits as ShapeLimits;
 use cellpos_ident::experiment::{Plan, RecordedSegment, Span, Turn};
 use cellpos_ident::identifiability::NOT_ACCOUNTED_S;
+use cellpos_numeric::statistics::quantiles;
 use cellpos_plant::Model;
 use cellpos_record::RunWriter;
 use cellpos_rig::Clock;
@@ -404,16 +405,10 @@ impl OnRig {
         let mut test = DelayTest::evaluate(switched_s, seen)?;
         // Pings come at any time, as the edges do, and wait for the board's next step. The commands of a loop come at one place in it: they
         // may wait for as little as the fastest pings, or for as much more than usual.
-        let at = |share: f64| {
-            let last = trips_s.len().saturating_sub(1) as f64;
-            trips_s.get((share * last) as usize).copied()
-        };
-        let usual_s = at(0.5);
-        let waits_s = usual_s
-            .zip(at(0.05))
-            .map(|(usual_s, least_s)| usual_s - least_s);
-        test.estimate.not_accounted_s += waits_s.unwrap_or(0.0).max(NOT_ACCOUNTED_S);
-        test.line_s = usual_s.map(|trip_s| 0.5 * trip_s);
+        let [least_s, usual_s] = quantiles(&trips_s, [0.05, 0.5]);
+        // Without a trip the difference is NaN, and `max` gives the other number.
+        test.estimate.not_accounted_s += (usual_s - least_s).max(NOT_ACCOUNTED_S);
+        test.line_s = usual_s.is_finite().then_some(0.5 * usual_s);
         Ok(test)
     }
 }

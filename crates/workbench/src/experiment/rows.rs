@@ -119,8 +119,8 @@ impl Rows {
             };
             // A late frame overwrites the command of a timer tick that has already taken its row.
             let row = exposed.clamp(next.saturating_sub(1), next + 10_000);
-            // In a row without a tick the command before it was held. What lies between it and the next would foretell that one, which answers
-            // the noise of these rows.
+            // In a row without a tick the command before it was held. A value between it and the next would depend on the next, which
+            // answers the noise of these rows.
             while rows.input.len() <= row {
                 let held_um = rows.input.last().copied().unwrap_or(tick.command_um);
                 rows.input.push(held_um);
@@ -144,8 +144,7 @@ impl Rows {
             // The row's command stands as if on time.
             rows.ages_ns[row] = late_ns.filter(|_| on_time).map(|late_ns| age_ns - late_ns);
             rows.input[row] = tick.command_um;
-            // A frame shows the bead when it was exposed. One that came half a period late came in a stall, and when the board had the
-            // commands of a stall nobody here knows.
+            // A frame that is half a period late came in a stall. When the board had the commands of a stall nobody here knows.
             if let Some(output) = rows.output.get_mut(exposed).filter(|_| on_time) {
                 *output = tick.measured_um;
             }

@@ -30,7 +30,7 @@ pub(super) fn section(
     bound: Option<&Bound>,
     learned: Option<(f64, f64)>,
 ) -> String {
-    let (status, ended) = ending(sessions);
+    let (mut status, ended) = ending(sessions);
     let kept = ended.is_none();
     let what = origin::subject(sessions.iter().find_map(|session| session.meta.as_ref()));
     let lost = counted(sessions, "frames_lost");
@@ -47,17 +47,12 @@ pub(super) fn section(
             sure: "no error was measured. What happened is in the record, and below.".to_string(),
             doubt: None,
         });
-    let status = match (status, doubt) {
-        (status, None) => status,
-        (status, Some(doubt)) => {
-            result.push_str(&format!(" {doubt}"));
-            if status == Emphasis::Good {
-                Emphasis::Warning
-            } else {
-                status
-            }
+    if let Some(doubt) = doubt {
+        result.push_str(&format!(" {doubt}"));
+        if status == Emphasis::Good {
+            status = Emphasis::Warning;
         }
-    };
+    }
     // How it ended comes first: the error is then that of a part.
     if let Some(ended) = ended {
         result.insert_str(0, &format!("The run did not end as planned: {ended}. "));
