@@ -185,11 +185,11 @@ def write(figures: Figures, bench: Bench):
     entries = list(figures.all.values())
     figures.save()
     page = ["# Measurements", "", "Every figure that the project claims. `scripts/book-measure` writes this page.", "",
-            "Measured with " + ", ".join(sorted({e["program"] for e in entries})) + ".", "",
+            "Measured with " + ", ".join(sorted({f"{e['program']} on {e['date']}" for e in entries})) + ".", "",
             "Closed loops run on the emulated rig, on the virtual clock. See [Limits](limits.md).", ""]
     for line in dict.fromkeys(e["command"] for e in entries):
         alike = [e for e in entries if e["command"] == line]
-        page += [f"**{command(line)}** ({max(e['date'] for e in alike)})", "", "| figure | what | value |", "|---|---|---|"]
+        page += [f"**{command(line)}**", "", "| figure | what | value |", "|---|---|---|"]
         page += [f"| `{e['id']}` | {e['what']} | {e['shown']} |" for e in alike] + [""]
     page += ["## Long tables", "", "| command | shows |", "|---|---|"]
     page += [f"| `{line}` | {what} |" for line, what in LONG]

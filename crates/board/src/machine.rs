@@ -325,7 +325,12 @@ impl Board {
             }
             ToBoard::Disarm => {
                 self.answer(Request::Disarm, Ok(()));
-                self.go_to_park(BoardState::Disarmed);
+                // A disarmed board stays: its power-up displacement is nobody's park.
+                if self.state == BoardState::Disarmed {
+                    self.send_status();
+                } else {
+                    self.go_to_park(BoardState::Disarmed);
+                }
             }
             ToBoard::Led { on } => {
                 self.led = on;

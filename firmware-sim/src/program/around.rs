@@ -159,9 +159,10 @@ impl Around {
                 return Ok(frames);
             }
             let delivery_ns = self.world.next_delivery_ns().unwrap_or(i64::MAX);
+            let row_ns = log.as_ref().map_or(i64::MAX, |log| log.next_ns());
             wait(
                 Some(self.terminal.as_fd()),
-                delivery_ns.min(now_ns + LONGEST_SLEEP_NS),
+                delivery_ns.min(row_ns).min(now_ns + LONGEST_SLEEP_NS),
             )?;
         }
     }

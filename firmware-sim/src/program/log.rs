@@ -73,6 +73,11 @@ impl Log {
             })
     }
 
+    /// Time of the next row, ns. A row that waited for the box's next event would always stand just behind a step of the output.
+    pub(super) fn next_ns(&self) -> i64 {
+        self.next_ns
+    }
+
     /// Writes a row when one is due.
     ///
     /// # Errors

@@ -204,6 +204,7 @@ fn pace(
         }
         // Do not look at a line before its time if it is stalled or between two packets.
         let event_ns = rig.next_event_ns().min(usb.next_event_ns(now_ns));
+        let event_ns = event_ns.min(log.as_ref().map_or(i64::MAX, |log| log.next_ns()));
         let readiness = (room > 0).then(|| line.readiness());
         wait(readiness, event_ns.min(now_ns + LONGEST_SLEEP_NS))?;
     }

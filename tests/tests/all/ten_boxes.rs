@@ -67,20 +67,21 @@ fn least(around: f64, wide: f64, step: f64, cost: impl Fn(f64) -> f64) -> (f64, 
         .expect("steps")
 }
 
-/// Delay from a command's tick to the tick that uses the frame that shows it, ms, by the box's own log: where its output followed the
-/// recorded commands, and its bead the recorded positions. `None` for a run that is too short.
+/// Delay of a record's rows, from the exposure of a frame to the output of the command that its tick computes, ms, by the box's own log:
+/// where its output followed the recorded commands, and its bead the recorded positions. The frame's own stamp counts in both, so its
+/// error cancels. The median of stretches of 3 s; `None` for a run that is too short.
 fn true_delay_ms(run: &Path, rows: &[BoxRow]) -> Option<f64> {
-    let (ticks, _) = RunReader::open(run).ok()?.ticks().ok()?;
-    let ticks: Vec<_> = ticks.into_iter().filter(|t| t.is_running()).collect();
-    let (first, last) = (ticks.first()?, ticks.last()?);
-    if ticks.len() < 3000 {
+    let (mut ticks, _) = RunReader::open(run).ok()?.ticks().ok()?;
+    ticks.retain(|t| t.is_running() && t.measured_um.is_finite());
+    ticks.dedup_by_key(|t| t.frame_id);
+    if ticks.len() < 4000 {
         return None;
     }
     let s = |ns: i64| ns as f64 * 1e-9;
-    let commands: Vec<(f64, f64)> = ticks.iter().map(|t| (s(t.time_ns), t.command_um)).collect();
+    let exposed_s: Vec<f64> = ticks.iter().map(|t| s(t.mid_exposure_ns)).collect();
     let held_um = |at: f64| {
-        let next = commands.partition_point(|(t, _)| *t <= at);
-        (next > 0 && at <= s(last.time_ns)).then(|| commands[next - 1].1)
+        let next = exposed_s.partition_point(|t| *t <= at);
+        (next > 0 && next < ticks.len()).then(|| ticks[next - 1].command_um)
     };
     let applied: Vec<(f64, f64)> = rows
         .iter()
@@ -90,14 +91,13 @@ fn true_delay_ms(run: &Path, rows: &[BoxRow]) -> Option<f64> {
         .iter()
         .map(|r| (s(r.monotonic_ns), r.bead_um))
         .collect();
-    // From the run's clock to the box's, with the delay of a command: one second of the log is enough to find it, three to refine it.
-    let misfit = |offset_s: f64, span_s: f64| {
-        let from = s(first.time_ns) + 0.5 + offset_s;
-        let begin = applied.partition_point(|(t, _)| *t < from);
-        let end = applied.partition_point(|(t, _)| *t < from + span_s);
+    // How far the output is from the command of the frame that was exposed `behind_s` earlier.
+    let misfit = |from_s: f64, span_s: f64, behind_s: f64| {
+        let begin = applied.partition_point(|(t, _)| *t < from_s + behind_s);
+        let end = applied.partition_point(|(t, _)| *t < from_s + span_s + behind_s);
         let (mut sum, mut count) = (0.0, 0);
         for (t, um) in &applied[begin..end] {
-            if let Some(held) = held_um(t - offset_s) {
+            if let Some(held) = held_um(t - behind_s) {
                 sum += (um - held).abs().min(0.02);
                 count += 1;
             }
@@ -108,34 +108,40 @@ fn true_delay_ms(run: &Path, rows: &[BoxRow]) -> Option<f64> {
             sum / f64::from(count)
         }
     };
-    let (from_s, to_s) = (applied.first()?.0, applied.last()?.0);
-    let middle = 0.5 * (from_s + to_s) - s(first.time_ns);
-    let (coarse, _) = least(middle, 0.5 * (to_s - from_s), 1e-3, |o| misfit(o, 1.0));
-    let (finer, _) = least(coarse, 2e-3, 1e-4, |o| misfit(o, 3.0));
-    let (offset_s, left_um) = least(finer, 2e-4, 1e-5, |o| misfit(o, 3.0));
+    let (from_s, to_s) = (exposed_s[0] + 0.5, exposed_s[exposed_s.len() - 1] - 3.0);
+    let (first_s, last_s) = (applied.first()?.0, applied.last()?.0);
+    let middle = 0.5 * (first_s + last_s) - from_s;
+    let (coarse_s, left_um) = least(middle, 0.5 * (last_s - first_s), 1e-3, |behind| {
+        misfit(from_s, 1.0, behind)
+    });
     if left_um > 0.01 {
         return None;
     }
-    let seen: Vec<(f64, f64)> = ticks
-        .iter()
-        .skip(1000)
-        .filter(|t| t.measured_um.is_finite())
-        .map(|t| (s(t.time_ns), t.measured_um))
-        .take(8000)
-        .collect();
-    let apart = |delay_s: f64| {
-        let mut off: Vec<f64> = (seen.iter())
-            .map(|(t, um)| um - interpolated(&bead, t + offset_s - delay_s))
-            .collect();
-        off.sort_by(f64::total_cmp);
-        let middle = off[off.len() / 2];
-        let mut far: Vec<f64> = off.iter().map(|um| (um - middle).abs()).collect();
-        far.sort_by(f64::total_cmp);
-        far[far.len() / 2]
+    let delay_s = |begin_s: f64| {
+        let (output_s, _) = least(coarse_s, 2e-3, 1e-4, |b| misfit(begin_s, 3.0, b));
+        let (output_s, _) = least(output_s, 2e-4, 1e-5, |b| misfit(begin_s, 3.0, b));
+        let begin = exposed_s.partition_point(|t| *t < begin_s);
+        let end = exposed_s.partition_point(|t| *t < begin_s + 3.0);
+        let apart = |delay_s: f64| {
+            let mut off: Vec<f64> = (ticks[begin..end].iter().zip(&exposed_s[begin..end]))
+                .map(|(t, at)| t.measured_um - interpolated(&bead, at + output_s - delay_s))
+                .collect();
+            off.sort_by(f64::total_cmp);
+            let middle = off[off.len() / 2];
+            let mut far: Vec<f64> = off.iter().map(|um| (um - middle).abs()).collect();
+            far.sort_by(f64::total_cmp);
+            far[far.len() / 2]
+        };
+        let (coarse_s, _) = least(6e-3, 6e-3, 1e-4, apart);
+        least(coarse_s, 2e-4, 5e-6, apart).0
     };
-    let (coarse_s, _) = least(6e-3, 6e-3, 1e-4, apart);
-    let (delay_s, _) = least(coarse_s, 2e-4, 5e-6, apart);
-    Some(1e3 * delay_s)
+    let mut delays_s: Vec<f64> = (0..)
+        .map(|k| from_s + 3.0 * f64::from(k))
+        .take_while(|begin_s| *begin_s < to_s)
+        .map(delay_s)
+        .collect();
+    delays_s.sort_by(f64::total_cmp);
+    delays_s.get(delays_s.len() / 2).map(|s| 1e3 * s)
 }
 
 fn runs_of_identify(folder: &Path) -> Vec<PathBuf> {

@@ -210,6 +210,21 @@ fn park_and_disarm_both_end_at_park_and_only_park_is_latched_as_safe() {
 }
 
 #[test]
+fn a_board_that_was_never_armed_stays_where_it_was_switched_on() {
+    let config = Config::default();
+    let power_up_um = f64::from(config.power_up_pm) * 1e-6;
+    assert_ne!(config.power_up_pm, config.park_pm);
+    let mut desk = Desk::new(config);
+    desk.say(ToBoard::Hello {
+        protocol: PROTOCOL_VERSION,
+    });
+    desk.say(ToBoard::Disarm);
+    desk.run(50.0);
+    assert_eq!(desk.board.state(), BoardState::Disarmed);
+    assert!((desk.applied_um() - power_up_um).abs() <= STEP_UM);
+}
+
+#[test]
 fn ignored_commands_do_not_feed_the_watchdog() {
     let mut desk = Desk::armed(Config::default(), Arm::session(1));
     desk.command(21.0, 20.0);

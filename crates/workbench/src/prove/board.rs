@@ -73,8 +73,6 @@ fn tried(sheet: &mut Sheet, talk: &mut Option<Talk>, trial: &mut Trial) -> Resul
     line(sheet, t)?;
     damage(sheet, t)?;
     unasked(sheet, t)?;
-    // A session before may have left the output moving.
-    t.request(&ToBoard::Disarm, Request::Disarm)?.ok();
     let Some(range) = Range::of(&identity, trial) else {
         sheet.complete(
             "board",
@@ -83,7 +81,7 @@ fn tried(sheet: &mut Sheet, talk: &mut Option<Talk>, trial: &mut Trial) -> Resul
         );
         return Ok(());
     };
-    range.settle(t, range.park_pm)?;
+    range.to_park(t)?;
     refusals(sheet, t, &identity, &range)?;
     if super::moves::moves(sheet, t, &range)? {
         super::silence::silence(sheet, t, &range)?;

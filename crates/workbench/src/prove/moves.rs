@@ -92,6 +92,23 @@ impl Range {
         Ok(status)
     }
 
+    /// Brings the output to park by a session of its own, and ends that: a board that had none since it was switched on knows only
+    /// its own park, which may be far from the rig's.
+    pub(super) fn to_park(&self, t: &mut Talk) -> Result<(), Failure> {
+        let mut armed = self.session(t, |_| {}, None)?;
+        if armed.as_ref().is_err_and(|why| why == "state") {
+            // After a reset it goes to its own park before anything else.
+            self.settle(t, self.own_park_pm)?;
+            armed = self.session(t, |_| {}, None)?;
+        }
+        if armed.is_ok() {
+            t.request(&ToBoard::Park, Request::Park)?.ok();
+            self.settle(t, self.park_pm)?;
+            t.request(&ToBoard::Disarm, Request::Disarm)?.ok();
+        }
+        Ok(())
+    }
+
     /// Whether the output is there, within a step and a half of the converter.
     pub(super) fn is_at(&self, status: &Status, at_pm: i32) -> bool {
         2 * (status.applied_pm - at_pm).abs() <= 3 * self.step_pm
