@@ -65,6 +65,12 @@ fn main() {
         });
     }
     localiser.expect_streak((0.0, 0.0));
+    let mut walled = scenes_of(0.0);
+    walled.iter_mut().for_each(Scene::beside_a_wall);
+    run("template fit, a wall in the window", &walled, |s| {
+        let fix = localiser.locate(&s.frame(), Some(frame(s).2));
+        Some((fix.x_px, fix.y_px))
+    });
     run("template fit, whole frame searched first", &scenes, |s| {
         let fix = localiser.locate(&s.frame(), None);
         Some((fix.x_px, fix.y_px))
@@ -159,6 +165,14 @@ impl Scene {
             x,
             y,
             guess,
+        }
+    }
+
+    /// Darkens the two first rows of the bead's window, and all before them.
+    fn beside_a_wall(&mut self) {
+        let rows = self.y.round() as usize + 2 - WINDOW / 2;
+        for grey in self.pixels.iter_mut().take(rows * SIDE) {
+            *grey -= 40;
         }
     }
 

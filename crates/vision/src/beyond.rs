@@ -23,11 +23,6 @@ const AT_REST: (f64, f64) = (0.01, 0.005);
 /// Parameters: x, y, contrast, level, slope of the light along the row, size, slope down the column.
 const ALL: usize = 7;
 
-const NONE: Asked = Asked {
-    slopes: false,
-    size: false,
-};
-
 /// Nuisance parameters to fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Asked {
@@ -37,17 +32,16 @@ pub(crate) struct Asked {
 
 /// The fit of all parameters, from one of place, contrast and level on. Leaves the window without the slope and the template at
 /// the size found, and gives the slope. `None` if the window does not separate the parameters, or they explain too little: then
-/// both are as before. `start` is the place, and the excess of the sum of squares over noise.
+/// both are as before. `start` is the place, the sum of squares that is left there, and how much of it is more than noise.
 pub(crate) fn fit(
     crop: &mut Crop,
     template: &mut Template,
     comb: &Comb,
-    start: ((f64, f64), f64),
+    start: ((f64, f64), f64, f64),
     weights: Weights,
     asked: Asked,
 ) -> Option<(f64, f64, Pass, (f64, f64))> {
-    let (at, misfit) = start;
-    let before = pass(crop, template, comb, at, weights, NONE)?.0.chi2;
+    let (at, before, misfit) = start;
     let size_before = template.size();
     let reach_px = 0.4 * template.radius_px();
     let mut taken = (0.0, 0.0);

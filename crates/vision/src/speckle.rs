@@ -80,6 +80,14 @@ pub(crate) fn clean_picture(values: &mut [f32], width: usize, noise: f32) {
     }
 }
 
+/// Whether a pixel can be a speck, by the two beside it. A speck is off the mean of its inner neighbours by [`LEAST_SIGMA`], and by
+/// [`LEAST_SPREADS`] (four) times their spread. If both beside it are nearer than d, so is an end of that spread, and it is off by less than
+/// d and a quarter of the same: less than four thirds of d.
+fn can_be(left: f32, value: f32, right: f32, noise: f32) -> bool {
+    let far = 0.75 * LEAST_SIGMA * noise;
+    value - left.min(right) > far || left.max(right) - value > far
+}
+
 /// Replaces the specks of a window that show without knowing the bead, and says how many. Those next to each other hide one
 /// another.
 pub(crate) fn clean(crop: &mut Crop, noise: f32) -> usize {
@@ -95,6 +103,9 @@ pub(crate) fn clean(crop: &mut Crop, noise: f32) -> usize {
             ) else {
                 continue;
             };
+            if !can_be(*d, *value, *e, noise) {
+                continue;
+            }
             let near = [*a, *b, *c, *d, *e, *f, *g, *h];
             if let Some(instead) = replacement(*value, near, noise) {
                 crop.rows[j][i] = instead;

@@ -34,6 +34,9 @@ const RECENTRE_PX: f64 = 1.0;
 const MAX_RECENTRES: u32 = 4;
 /// Half-width in bead radii of the window that leaves neighbours out.
 const NARROW_RADII: f64 = 1.3;
+/// Fixes that begin with the narrow window after one in which the whole was no good: something stands beside the bead, and one in so many
+/// asks whether it still does.
+const NARROW_FIXES: u32 = 32;
 /// Steps in the length of a streak per fit.
 const STRETCHES: usize = 2;
 /// A streak's length is looked for within this factor of the expected one.
@@ -63,6 +66,8 @@ pub struct Localiser {
     comb: Comb,
     /// What the template leaves of the beads' windows.
     residues: Residues,
+    /// So many fixes more begin with the narrow window.
+    narrow_fixes: u32,
     /// Whether specks that show without knowing the bead are replaced in the windows of this fix.
     cleans: bool,
     /// How much of what may be lopsided was in the last fit that was asked.
@@ -126,6 +131,7 @@ impl Localiser {
             streak: Way::default(),
             comb: Comb::STILL,
             residues: Residues::new(),
+            narrow_fixes: 0,
             cleans: false,
             lopsided: 0.0,
             shading_px2,
@@ -206,6 +212,15 @@ impl Localiser {
     fn locate_in(&mut self, view: &View, (x_px, y_px): (f64, f64)) -> Fix {
         let radius_px = self.template.radius_px();
         let window_px = self.config.window_px;
+        let narrow_px = 2 * (NARROW_RADII * radius_px).ceil() as usize + 1;
+        let narrow_first = self.narrow_fixes > 0 && narrow_px < window_px;
+        if narrow_first {
+            self.narrow_fixes -= 1;
+            let fix = self.attempt(view, (x_px, y_px), narrow_px);
+            if fix.verdict == FixQuality::Good {
+                return fix;
+            }
+        }
         let fix = self.attempt(view, (x_px, y_px), window_px);
         if fix.verdict == FixQuality::Good && !view.is_draft {
             self.learn(&fix);
@@ -214,10 +229,13 @@ impl Localiser {
             return fix;
         }
         // A neighbour may have come into the window's corner: once more with a window that just holds the bead.
-        let narrow_px = 2 * (NARROW_RADII * radius_px).ceil() as usize + 1;
-        if narrow_px < window_px {
+        if narrow_px < window_px && !narrow_first {
             let again = self.attempt(view, (x_px, y_px), narrow_px);
             if again.verdict == FixQuality::Good {
+                // Only whole windows are learnt from.
+                if self.learner.is_none() && !view.is_draft {
+                    self.narrow_fixes = NARROW_FIXES;
+                }
                 return again;
             }
         }

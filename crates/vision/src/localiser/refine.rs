@@ -79,7 +79,7 @@ impl Localiser {
         let weights = self.weights(Some(&f.pass));
         let pixels = (self.crop.width * self.crop.height) as f64;
         let misfit = f.pass.chi2 - self.weight_unit() * (pixels - 4.0);
-        let start = ((f.x_px, f.y_px), misfit);
+        let start = ((f.x_px, f.y_px), f.pass.chi2, misfit);
         let found = beyond::fit(
             &mut self.crop,
             &mut self.template,

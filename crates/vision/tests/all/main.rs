@@ -1,5 +1,6 @@
 //! Pictures, rendered and recorded, through localiser and trackers.
 
+mod beside_a_wall;
 mod bound;
 mod cell_lab;
 mod cell_table;
