@@ -35,7 +35,11 @@ pub fn bootstrap(
                         / (n as f64 - 1.0)
                         * fit.scale)
                         .sqrt();
-                    p.response + sum / n as f64 * size
+                    let strays = match problem.stray_s() {
+                        0.0 => 0.0,
+                        sd_s => std::f64::consts::TAU * p.frequency_hz * sd_s * random.normal(),
+                    };
+                    p.response * Complex::new(1.0, -strays) + sum / n as f64 * size
                 })
                 .collect();
             let moved = [(); 2].map(|()| fit.scale.sqrt() * random.normal());

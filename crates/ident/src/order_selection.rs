@@ -5,6 +5,8 @@
 //! full Eq. (4). A higher order is chosen only if three tests agree: an F-test rejects the lower one (1 %), AICc falls, and the fit to
 //! one half of the blocks predicts the other half better. The quality of a parameter comes from [`crate::identifiability`].
 
+mod stray;
+
 pub use crate::candidate_order::{
     CandidateFit, CandidateFits, CandidateOrder, DelayPrior, index, model_of,
 };
@@ -23,7 +25,10 @@ pub struct OrderSelection<'a> {
     points: &'a [FrequencyPoint],
     sampling: Sampling,
     prior: Option<DelayPrior>,
-    weights: Vec<f64>,
+    /// Weights of the residuals along the point's response and across it, which are those of gain and phase.
+    weights: Vec<[f64; 2]>,
+    /// Standard deviation of each line's delay about the common one, s.
+    stray_s: f64,
     /// Shift of the two weak bounds (share, lead), in their standard deviations.
     bounds_moved: [f64; 2],
     /// Orders with two lags are candidates.
@@ -69,12 +74,12 @@ impl<'a> OrderSelection<'a> {
                 expected: "a positive variance per point (record at least two periods, with noise)",
             });
         }
-        let weights = points.iter().map(|p| (2.0 / p.variance).sqrt()).collect();
         Ok(Self {
             points,
             sampling,
             prior,
-            weights,
+            weights: stray::weights(points, 0.0),
+            stray_s: 0.0,
             bounds_moved: [0.0; 2],
             two_lags: false,
         })
@@ -87,9 +92,11 @@ impl<'a> OrderSelection<'a> {
     fn residuals(&self, data: &[Complex<f64>], model: &CandidateModel, out: &mut [f64]) {
         let sampler = model.sampler(self.sampling);
         for (i, (p, y)) in self.points.iter().zip(data).enumerate() {
-            let e = (y - sampler.response(p.frequency_hz)) * self.weights[i];
-            out[2 * i] = e.re;
-            out[2 * i + 1] = e.im;
+            let size = p.response.norm().max(f64::MIN_POSITIVE);
+            let e = (y - sampler.response(p.frequency_hz)) * (p.response.conj() / size);
+            let [of_gain, of_phase] = self.weights[i];
+            out[2 * i] = e.re * of_gain;
+            out[2 * i + 1] = e.im * of_phase;
         }
         let last = 2 * self.points.len();
         out[last] = self
@@ -196,7 +203,7 @@ impl<'a> OrderSelection<'a> {
         while delay_ms <= 20.0 * period_ms {
             let unit = CandidateModel::integrator(1.0, delay_ms * 1e-3).sampler(self.sampling);
             let (mut cross, mut power) = (0.0, 0.0);
-            for ((p, y), w) in self.points.iter().zip(data).zip(&self.weights) {
+            for ((p, y), [w, _]) in self.points.iter().zip(data).zip(&self.weights) {
                 let h = unit.response(p.frequency_hz);
                 // Relative weights with a ceiling: the start must not depend on one very precise line.
                 let weight = (w * y.norm()).min(100.0) / y.norm();

@@ -63,6 +63,10 @@ pub struct Identification {
     pub warnings: Vec<String>,
 }
 
+/// A command acts with the next step of the board's output (docs/board.md), up to so much later, s. Where in a step commands come stays for
+/// a while and wanders from line to line, as two clocks do: a uniform error, the same for the whole of a line.
+const OUTPUT_STEP_S: f64 = 1e-4;
+
 /// Response of the plant at a measured point: the record's response, divided by that of the model with sampling and delay, times that
 /// of the model alone. Exact for a correct model, and insensitive otherwise, because only the ratio of the model with and without
 /// sampling enters.
@@ -91,7 +95,8 @@ pub fn summarise(
 ) -> Result<Identification, IdentError> {
     measured.points = of_one_delay(measured.points, sampling, two_lags)?;
     let problem = OrderSelection::new(&measured.points, sampling, None)?.with_two_lags(two_lags);
-    let selection = problem.fit()?;
+    let (problem, selection) = problem.fit_straying(OUTPUT_STEP_S / 12f64.sqrt())?;
+    let stray_s = problem.stray_s();
     let prior = led.map(|l| DelayPrior {
         delay_s: l.delay_s,
         // What is not accounted for may be anything within its bounds.
@@ -105,9 +110,9 @@ pub fn summarise(
         .parameter("delay_ms")
         .map_or(0.0, |p| (p.ci95[1] - p.ci95[0]) * 1e-3 / 3.92);
     let delay_sd_s = if delay_sd_s.is_finite() {
-        delay_sd_s
+        delay_sd_s.hypot(stray_s)
     } else {
-        0.0
+        stray_s
     };
     let compensated = measured
         .points

@@ -5,3 +5,4 @@ mod common;
 mod frequency_response;
 mod measured_piezo;
 mod slow_actuator;
+mod straying;
