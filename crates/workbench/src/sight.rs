@@ -11,12 +11,14 @@ use serde::Serialize;
 /// Result of the loop's tracker on some frames.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Sight {
-    /// Number of frames since it first accepted a bead or cell.
+    /// Number of frames since it first accepted a bead or cell, without those in which it had left.
     pub frames: u64,
     /// Of these, with a position.
     pub seen: u64,
     /// Frames before the first.
     pub before: u64,
+    /// Frames after it was last seen in an outer quarter of the picture: a free bead drifts out.
+    pub left: u64,
     /// Noise of a position along the rows, as stated by the fit, median, px.
     pub stated_px: f64,
     /// The same from the steps between successive frames, px; none if the bead's own motion hides it.
@@ -60,8 +62,11 @@ impl Sight {
             places.push((kept.stamp.id, seen.map(|seen| seen.x_px)));
         }
         let before = places.iter().take_while(|(_, x)| x.is_none()).count();
+        let width = frames.first().map_or(0, |kept| kept.frame.width);
+        let left = frames_after_leaving(&places, width as f64);
         Ok(Self {
-            frames: (places.len() - before) as u64,
+            frames: (places.len() - before - left) as u64,
+            left: left as u64,
             seen: sds.len() as u64,
             before: before as u64,
             stated_px: quantile(&sds, 0.5),
@@ -75,6 +80,17 @@ impl Sight {
     pub fn recall(&self) -> f64 {
         self.seen as f64 / self.frames.max(1) as f64
     }
+}
+
+/// Frames without a bead that was last seen in an outer quarter of a picture of this width.
+fn frames_after_leaving(places: &[(u64, Option<f64>)], width_px: f64) -> usize {
+    let mut last_px = None;
+    let has_left = |(_, x_px): &&(u64, Option<f64>)| {
+        last_px = x_px.or(last_px);
+        let outside = |x: f64| (x - 0.5 * (width_px - 1.0)).abs() > 0.25 * width_px;
+        x_px.is_none() && last_px.is_some_and(outside)
+    };
+    places.iter().filter(has_left).count()
 }
 
 /// Noise of a position from successive frames. Noise correlates successive steps negatively; free motion does not. The blur of
@@ -130,6 +146,25 @@ mod tests {
             })
             .collect();
         noise_px(&places)
+    }
+
+    #[test]
+    fn a_bead_that_drifts_out_has_left_and_one_that_is_lost_in_the_middle_has_not() {
+        let seen = |x: f64| (0, Some(x));
+        let gone = (0, None);
+        let drifts = [
+            gone,
+            seen(32.0),
+            gone,
+            seen(60.0),
+            gone,
+            gone,
+            seen(3.0),
+            gone,
+            seen(30.0),
+            gone,
+        ];
+        assert_eq!(frames_after_leaving(&drifts, 64.0), 3);
     }
 
     #[test]

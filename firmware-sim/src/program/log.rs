@@ -73,7 +73,7 @@ impl Log {
             })
     }
 
-    /// Time of the next row, ns. A row that waited for the box's next event would always stand just behind a step of the output.
+    /// Time of the next row, ns. Rows that waited for the box's next event would stand just behind steps of the output, none just before.
     pub(super) fn next_ns(&self) -> i64 {
         self.next_ns
     }

@@ -135,6 +135,17 @@ fn ask_for_real_time() {
     }
 }
 
+fn note(log: &mut Log, rig: &RigInABox) -> Result<(), ProgramError> {
+    log.note(&Instant {
+        now_ns: rig.now_ns(),
+        applied_um: rig.applied_um(),
+        pzt_um: rig.world().pzt_um(),
+        bead_um: rig.world().bead_um(),
+        state: &format!("{:?}", rig.board().state()),
+        fault: &format!("{:?}", rig.board().fault()),
+    })
+}
+
 /// The loop; returns the number of frames handed to clients.
 fn pace(
     rig: &mut RigInABox,
@@ -150,6 +161,11 @@ fn pace(
     let mut was_stalled = false;
     loop {
         let now_ns = monotonic_ns();
+        // The rows that are due, before anything that came since can act.
+        while let Some(log) = log.as_deref_mut().filter(|log| log.next_ns() <= now_ns) {
+            rig.advance_to(log.next_ns());
+            note(log, rig)?;
+        }
         let stalled = usb.is_stalled(now_ns);
         if stalled != was_stalled {
             line.stall(stalled)?;
@@ -190,14 +206,7 @@ fn pace(
             while rig.world_mut().take_position().is_some() {}
         }
         if let Some(log) = log.as_deref_mut() {
-            log.note(&Instant {
-                now_ns: rig.now_ns(),
-                applied_um: rig.applied_um(),
-                pzt_um: rig.world().pzt_um(),
-                bead_um: rig.world().bead_um(),
-                state: &format!("{:?}", rig.board().state()),
-                fault: &format!("{:?}", rig.board().fault()),
-            })?;
+            note(log, rig)?;
         }
         if stop.load(Ordering::Relaxed) || now_ns >= end_ns {
             return Ok(frames);

@@ -175,6 +175,8 @@ pub(super) struct Following {
     hold: Hold,
     /// What the zero flow at the start is uncertain by, as a way in a tick, um.
     start_um: f64,
+    /// Age of fixes in ticks: whole ones, and the part of one.
+    age: (usize, f64),
     /// Ticks from a command to the fix that shows it, and those after which the distance of a bead that is away tells something.
     delay: usize,
     away_ticks: f64,
@@ -193,9 +195,7 @@ impl Following {
     /// For an estimator and a plant, and fixes that are `delay_s` old.
     pub(super) fn new(config: &EstimatorConfig, model: &LoopModel, delay_s: f64) -> Self {
         let sample_s = model.sample_time_s;
-        let delay = (delay_s / sample_s)
-            .round()
-            .clamp(0.0, (COMMANDS - 3) as f64);
+        let age = (delay_s / sample_s).clamp(0.0, (COMMANDS - 4) as f64);
         let slow: f64 = model.modes.iter().map(|mode| mode.residue_per_s).sum();
         let quick = slow.abs() < SLOW_SHARE * model.gain_per_s.abs();
         let gain = if quick {
@@ -219,7 +219,8 @@ impl Following {
             },
             hold: Hold::new(config.diffusion_um2_per_s, delay_s, sample_s),
             start_um: gain * config.neutral_initial_um,
-            delay: delay as usize + 1,
+            age: (age as usize, age.fract()),
+            delay: age.ceil() as usize + 1,
             away_ticks: AWAY_DELAYS * delay_and_hold_s / sample_s,
             commands_um: [0.0; COMMANDS],
             known: 0,
@@ -253,6 +254,18 @@ impl Following {
         });
     }
 
+    /// The displacement that moved the bead from the last fix to that of this tick, in the mean, and its change with a tick of delay, um:
+    /// unless fixes are a whole number of ticks old, the command changed meanwhile. `None` while too few commands are known.
+    fn shown_um(&self) -> Option<(f64, f64)> {
+        let (whole, part) = self.age;
+        let newest = self.commands_um.get(whole + 1..whole + 3);
+        let &[now_um, before_um] = newest.filter(|_| self.known > whole + 2)? else {
+            return None;
+        };
+        let change_um = before_um - now_um;
+        Some((now_um + part * change_um, change_um))
+    }
+
     /// Takes in a tick. Gives what the bead does instead of following the commands, and the displacement at which it rested before, um.
     pub(super) fn step(&mut self, seen: &Seen) -> Option<(Instead, f64)> {
         if self.gain == 0.0 {
@@ -261,8 +274,7 @@ impl Following {
         self.commands_um.copy_within(..COMMANDS - 1, 1);
         self.commands_um[0] = seen.command_um;
         self.known = (self.known + 1).min(COMMANDS);
-        let newest = self.commands_um.get(self.delay..self.delay + 2);
-        let Some(&[now_um, before_um]) = newest.filter(|_| self.known > self.delay + 1) else {
+        let Some((now_um, change_um)) = self.shown_um() else {
             self.mean_um = seen.command_um;
             return None;
         };
@@ -270,7 +282,7 @@ impl Following {
         let shift_um = self.mean_share * (now_um - self.mean_um);
         self.mean_um += shift_um;
         let driven_um = self.gain * (now_um - self.mean_um);
-        let doubt_um = DELAY_ERROR * self.gain * (now_um - before_um);
+        let doubt_um = DELAY_ERROR * self.gain * change_um;
         if let Some(beliefs) = &mut self.beliefs {
             let shift_um = self.gain * shift_um;
             let Beliefs {

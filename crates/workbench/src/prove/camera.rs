@@ -165,8 +165,8 @@ fn judge_sight(sheet: &mut Sheet, bench: &Bench, sight: &Sight) {
             0 => "nothing that vision believes in: cellpos camera --rig RIG --find-beads beads.png"
                 .to_string(),
             seen => format!(
-                "{seen} of {} frames, contrast {:.0} times the noise",
-                sight.frames, sight.snr
+                "{seen} of {} frames, contrast {:.0} times the noise; {} more after it had drifted out",
+                sight.frames, sight.snr, sight.left
             ),
         },
     );

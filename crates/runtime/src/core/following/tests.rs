@@ -10,6 +10,8 @@ struct World<'a> {
     gain_ratio: &'a dyn Fn(f64) -> f64,
     axis: f64,
     rate_hz: f64,
+    /// Age of a fix at its tick, s.
+    late_s: f64,
     /// Displacements that the actuator gives, um.
     range: &'a dyn Fn(f64) -> [f64; 2],
     zero_flow: &'a dyn Fn(f64) -> f64,
@@ -32,6 +34,7 @@ impl Default for World<'_> {
             gain_ratio: &|_| 1.0,
             axis: 1.0,
             rate_hz: 1000.0,
+            late_s: 2e-3,
             range: &|_| [0.0, 40.0],
             zero_flow: &|_| 20.0,
             reference: &|_| 0.0,
@@ -53,13 +56,14 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
     let dt = 1.0 / world.rate_hz;
     let model = LoopModel {
         sample_time_s: dt,
-        ..LoopModel::integrator(380.0 * world.axis, 2e-3)
+        ..LoopModel::integrator(380.0 * world.axis, world.late_s)
     };
     let config = EstimatorConfig::default();
-    let mut following = Following::new(&config, &model, 2e-3);
-    let late = (2e-3 * world.rate_hz).round() as usize;
+    let mut following = Following::new(&config, &model, world.late_s);
+    let late = world.late_s * world.rate_hz;
+    let (late, part) = (late.round() as usize, late - late.round());
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
-    let mut seen = std::collections::VecDeque::from(vec![0.0; late + 1]);
+    let mut seen = std::collections::VecDeque::from(vec![0.0; late + 2]);
     let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
     for k in 0..(world.seconds * world.rate_hz) as u64 {
         let t = k as f64 * dt;
@@ -86,7 +90,10 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
             following.skip(command_um);
             continue;
         }
-        let fix_um = seen[0] + (world.shakes)(t) + 0.015 * noise(&mut state);
+        // Behind the newest by a whole number of ticks, and a part of one before or after that.
+        let other = if part > 0.0 { seen[0] } else { seen[2] };
+        let shown_um = seen[1] + part.abs() * (other - seen[1]);
+        let fix_um = shown_um + (world.shakes)(t) + 0.015 * noise(&mut state);
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
         zero_um -= 8.0 * dt * error_um;
@@ -263,6 +270,32 @@ fn a_picture_that_shakes_is_not_taken_for_a_bead_that_does_not_follow() {
                 ..World::default()
             });
             assert_eq!(told, None, "{hz} Hz, seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn fast_excitation_and_fixes_of_any_age_are_no_wrong_sign() {
+    for late_ms in [1.0, 2.4, 2.6, 4.5, 5.51] {
+        for hz in [150.0, 220.0, 300.0] {
+            for gain in [0.6, 1.0, 1.6] {
+                for seed in 1..=4 {
+                    let found = found_by(&World {
+                        seed,
+                        late_s: late_ms * 1e-3,
+                        gain_ratio: &|_| gain,
+                        added: &|t| 1.5 * (std::f64::consts::TAU * hz * t).sin(),
+                        // A machine that stalls.
+                        lost: &|k| k % 371 < 9,
+                        seconds: 5.0,
+                        ..World::default()
+                    });
+                    assert_eq!(
+                        found, None,
+                        "{late_ms} ms, {hz} Hz, gain {gain}, seed {seed}"
+                    );
+                }
+            }
         }
     }
 }
