@@ -81,7 +81,7 @@ fn tried(sheet: &mut Sheet, talk: &mut Option<Talk>, trial: &mut Trial) -> Resul
         );
         return Ok(());
     };
-    range.to_park(t)?;
+    range.park(t)?;
     refusals(sheet, t, &identity, &range)?;
     if super::moves::moves(sheet, t, &range)? {
         super::silence::silence(sheet, t, &range)?;

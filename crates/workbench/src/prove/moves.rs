@@ -94,7 +94,7 @@ impl Range {
 
     /// Brings the output to park by a session of its own, and ends that: a board that had none since it was switched on knows only
     /// its own park, which may be far from the rig's.
-    pub(super) fn to_park(&self, t: &mut Talk) -> Result<(), Failure> {
+    pub(super) fn park(&self, t: &mut Talk) -> Result<(), Failure> {
         let mut armed = self.session(t, |_| {}, None)?;
         if armed.as_ref().is_err_and(|why| why == "state") {
             // After a reset it goes to its own park before anything else.
