@@ -2,6 +2,7 @@
 # Installs Debian's Aravis (libraries and the fake GigE Vision camera) and runs the tests of industrial cameras against
 # it on loopback. Asks for root only to install what is missing.
 #   scripts/fake-camera.sh           run the tests
+#   scripts/fake-camera.sh install         install only
 #   scripts/fake-camera.sh serve     serve the fake camera on 127.0.0.1 until interrupted, to try cellpos camera
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -18,6 +19,7 @@ if ((${#missing[@]})); then
     "${as_root[@]}" apt-get install -y --no-install-recommends "${missing[@]}"
 fi
 
+[[ ${1:-} == install ]] && exit 0
 if [[ ${1:-} == serve ]]; then
     echo "fake camera on 127.0.0.1; in another terminal: cargo run --release --features aravis -- camera --address 127.0.0.1 --region 64x64+0+0"
     exec arv-fake-gv-camera-0.8 -i 127.0.0.1

@@ -5,6 +5,7 @@
 #   scripts/firmware-qemu.sh          all of it
 #   scripts/firmware-qemu.sh build    the firmware for QEMU only
 #   scripts/firmware-qemu.sh rp2350   the firmware for the RP2350 only
+#   scripts/firmware-qemu.sh install  the tools only
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -16,6 +17,7 @@ if [ ${#need[@]} -gt 0 ]; then
   [ "$(id -u)" = 0 ] || { echo "as root: apt-get install ${need[*]}" >&2; exit 2; }
   apt-get update -q && apt-get install -y -q --no-install-recommends "${need[@]}"
 fi
+[ "${1:-all}" = install ] && exit 0
 # Compiler, cargo and the library's source must be one release: -Zbuild-std compiles the one with the other.
 versions=$(dpkg-query -W -f '${Version}\n' rustc-web cargo-web rust-web-src | sort -u)
 [ "$(wc -l <<<"$versions")" = 1 ] || { echo "rustc-web, cargo-web and rust-web-src differ:" $versions >&2; exit 2; }

@@ -38,6 +38,11 @@ pub struct OrderSelection<'a> {
 /// Finite-difference steps of the parameter vector.
 const STEPS: [f64; 7] = [1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 1e-4, 1e-4];
 
+/// Mean square of a residual whose weight was estimated with so many degrees of freedom: the variance of Student's t.
+fn noise_of_weight(dof: f64) -> f64 {
+    if dof > 2.5 { dof / (dof - 2.0) } else { 1.0 }
+}
+
 /// Prior of the far zero's lead: zero, with this part of a sampling period as standard deviation. A lead of a period or more would be a
 /// second delay.
 const LEAD_SD_PERIODS: f64 = 0.3;
@@ -384,8 +389,8 @@ impl<'a> OrderSelection<'a> {
             variance_dof
         };
         // Weights estimated from few blocks make intervals too short by this factor.
-        let weight_noise = if from_scatter && variance_dof > 2.5 {
-            variance_dof / (variance_dof - 2.0)
+        let weight_noise = if from_scatter {
+            noise_of_weight(variance_dof)
         } else {
             1.0
         };

@@ -63,8 +63,8 @@ pub struct Identification {
     pub warnings: Vec<String>,
 }
 
-/// A command acts with the next step of the board's output (docs/board.md), up to so much later, s. Where in a step commands come stays for
-/// a while and wanders from line to line, as two clocks do: a uniform error, the same for the whole of a line.
+/// A command acts with the next step of the board's output (docs/board.md), up to so much later, s. The place in a step at which commands
+/// arrive wanders slowly, as the difference of two clocks does. So all of a line has one error, which is uniform within a step.
 const OUTPUT_STEP_S: f64 = 1e-4;
 
 /// Response of the plant at a measured point: the record's response, divided by that of the model with sampling and delay, times that
@@ -108,12 +108,10 @@ pub fn summarise(
     let disagreement = judged.contradiction_s;
     let delay_sd_s = judged
         .parameter("delay_ms")
-        .map_or(0.0, |p| (p.ci95[1] - p.ci95[0]) * 1e-3 / 3.92);
-    let delay_sd_s = if delay_sd_s.is_finite() {
-        delay_sd_s.hypot(stray_s)
-    } else {
-        stray_s
-    };
+        .map(|p| (p.ci95[1] - p.ci95[0]) * 1e-3 / 3.92)
+        .filter(|sd_s| sd_s.is_finite())
+        .unwrap_or(0.0)
+        .hypot(stray_s);
     let compensated = measured
         .points
         .iter()

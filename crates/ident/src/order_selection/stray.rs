@@ -1,6 +1,6 @@
 //! Delays that stray from line to line: a board's output has steps, and where in a step a command comes wanders.
 
-use super::{CandidateFits, OrderSelection};
+use super::{CandidateFits, OrderSelection, noise_of_weight};
 use crate::error::IdentError;
 use crate::frequency_response::FrequencyPoint;
 use std::f64::consts::TAU;
@@ -18,9 +18,9 @@ pub(super) fn weights(points: &[FrequencyPoint], stray_s: f64) -> Vec<[f64; 2]> 
 }
 
 impl OrderSelection<'_> {
-    /// The problem and its fit, with a delay of each line that strays about the common one. By how much the phases' residuals tell: they
-    /// become as large as the noise makes them (the moment estimate of Paule and Mandel, 1982, of a variance between groups). `most_s` is the
-    /// largest standard deviation that is possible; what is left with it is something else.
+    /// The problem and its fit, with a delay of each line that strays about the common one. The residuals of the phases tell by how much:
+    /// with it they are as large as the noise makes them. This is the moment estimate of a variance between groups (Paule and Mandel,
+    /// 1982). `most_s` is the largest standard deviation that is possible; residuals that exceed the noise even then have another cause.
     ///
     /// # Errors
     /// Those of [`OrderSelection::fit`].
@@ -61,12 +61,8 @@ impl OrderSelection<'_> {
     fn fit_with(&mut self, stray_s: f64) -> Result<(CandidateFits, bool), IdentError> {
         self.set_stray(stray_s);
         let fits = self.fit()?;
-        // Weights from few blocks make residuals larger by the variance of Student's t.
-        let of = |p: &FrequencyPoint| match p.variance_dof {
-            dof if dof > 2.5 => dof / (dof - 2.0),
-            _ => 1.0,
-        };
-        let noise = self.points.iter().map(of).sum::<f64>() / self.points.len() as f64;
+        let of_weights = self.points.iter().map(|p| noise_of_weight(p.variance_dof));
+        let noise = of_weights.sum::<f64>() / self.points.len() as f64;
         let best = fits.best();
         let mut residuals = vec![0.0; self.rows()];
         self.residuals(&self.data(), &best.model, &mut residuals);

@@ -1,6 +1,6 @@
 //! Drift, feedback at low coherence, lost beads, multisines: what a frequency response must stand.
 
-use crate::common::{PERIOD_S, PositionRig, expected};
+use crate::common::{PERIOD_S, PositionRig, expected, measured};
 use cellpos_ident::IdentError;
 use cellpos_ident::bare_fft;
 use cellpos_ident::candidate_model::CandidateModel;
@@ -228,19 +228,8 @@ fn a_literal_63_per_s_is_flagged_as_a_factor_of_two_pi() {
         pzt_um: 3.0,
         slew_um_per_s: 40_000.0,
     };
-    let plan = Plan::stepped_sines(
-        &[2.0, 5.0, 10.0, 20.0, 60.0, 150.0],
-        &expected(0.002),
-        limits,
-        PERIOD_S,
-        20.0,
-    );
-    let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, 21);
-    let records = plan.run(&mut rig, 0, |_| {}).unwrap();
+    let measured = measured(&[2.0, 5.0, 10.0, 20.0, 60.0, 150.0], limits, 21);
     let sampling = Sampling::held(1.0 / PERIOD_S);
-    let settings = Settings::default();
-    let measured = plan.analyse_with_noise(&records, &settings, sampling, false);
-    let measured = measured.unwrap();
     let with = |stated_per_s| {
         summarise(measured.clone(), sampling, None, 0, 1, stated_per_s, false).unwrap()
     };

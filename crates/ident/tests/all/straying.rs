@@ -1,36 +1,22 @@
 //! A board's output has steps, and where in a step commands come wanders from line to line: no effect of the plant.
 
-use crate::common::{PERIOD_S, PositionRig, expected};
+use crate::common::{PERIOD_S, measured};
 use cellpos_ident::candidate_model::CandidateModel;
 use cellpos_ident::excitation::{ExcitationLimits, PAPER_FREQUENCIES_HZ};
-use cellpos_ident::experiment::{Measured, Plan};
-use cellpos_ident::frequency_response::Settings;
+use cellpos_ident::experiment::Measured;
 use cellpos_ident::sampled::Sampling;
 use cellpos_ident::summary::{Identification, summarise};
 use cellpos_numeric::Random;
-use cellpos_plant::{Complex, TransferFunction};
+use cellpos_plant::Complex;
 
-const DELAY_S: f64 = 0.002;
-
-fn measured(seed: u64) -> Measured {
+fn of_seed(seed: u64) -> Measured {
     let limits = ExcitationLimits {
         bead_um_per_s: 400.0,
         bead_um: 3.0,
         pzt_um: 2.0,
         slew_um_per_s: 40_000.0,
     };
-    let plan = Plan::stepped_sines(
-        &PAPER_FREQUENCIES_HZ,
-        &expected(DELAY_S),
-        limits,
-        PERIOD_S,
-        20.0,
-    );
-    let mut rig = PositionRig::new(&TransferFunction::eq6(), DELAY_S, seed);
-    let records = plan.run(&mut rig, 0, |_| {}).unwrap();
-    let sampling = Sampling::held(1.0 / PERIOD_S);
-    plan.analyse_with_noise(&records, &Settings::default(), sampling, false)
-        .unwrap()
+    measured(&PAPER_FREQUENCIES_HZ, limits, seed)
 }
 
 fn result(measured: Measured) -> Identification {
@@ -47,7 +33,7 @@ fn holds_more_than_eq4(result: &Identification) -> bool {
 
 /// The effective delay's truth and interval, ms.
 fn delay(result: &Identification) -> (f64, [f64; 2]) {
-    let truth = CandidateModel::eq6(DELAY_S);
+    let truth = CandidateModel::eq6(0.002);
     let of = result.judged.parameter("effective_delay_ms").unwrap();
     ((truth.delay_s - truth.far_lead_s) * 1e3, of.ci95)
 }
@@ -57,7 +43,7 @@ fn delays_that_stray_within_a_step_of_the_output_widen_the_phase_and_are_no_effe
     let (mut held, mut said) = (0, 0);
     const SEEDS: u64 = 20;
     for seed in 0..SEEDS {
-        let mut measured = measured(500 + seed);
+        let mut measured = of_seed(500 + seed);
         let mut random = Random::new(seed);
         for p in &mut measured.points {
             let later_s = 1e-4 * (random.uniform() - 0.5);
@@ -75,7 +61,7 @@ fn delays_that_stray_within_a_step_of_the_output_widen_the_phase_and_are_no_effe
 
 #[test]
 fn a_resonance_is_more_than_delays_that_stray() {
-    let mut measured = measured(77);
+    let mut measured = of_seed(77);
     // 250 Hz, damping 0.1: at 200 Hz three decibels too much and 25 degrees too late.
     for p in &mut measured.points {
         let r = p.frequency_hz / 250.0;
@@ -88,7 +74,7 @@ fn a_resonance_is_more_than_delays_that_stray() {
 fn on_a_plant_whose_delay_stays_nothing_changes() {
     let (mut width, mut said) = (0.0, 0);
     for seed in 0..10 {
-        let result = result(measured(900 + seed));
+        let result = result(of_seed(900 + seed));
         let (_, [low, high]) = delay(&result);
         width += 0.1 * (high - low);
         said += usize::from(holds_more_than_eq4(&result));

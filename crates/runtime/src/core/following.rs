@@ -173,7 +173,7 @@ pub(super) struct Following {
     gain: f64,
     noise: Noise,
     hold: Hold,
-    /// What the zero flow at the start is uncertain by, as a way in a tick, um.
+    /// Uncertainty of the zero flow at the start, as a way in a tick, um.
     start_um: f64,
     /// Age of fixes in ticks: whole ones, and the part of one.
     age: (usize, f64),

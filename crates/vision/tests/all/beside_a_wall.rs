@@ -1,9 +1,7 @@
 //! A wall stands in the window of a bead: a window that just holds the bead does, and the whole one again once the wall is gone.
 
-use crate::common::{Random, SIDE, frame, render};
-use cellpos_vision::{
-    FixQuality, Localiser, LocaliserConfig, PixelNoise, ProfileSpec, RingProfile,
-};
+use crate::common::{Random, SIDE, frame, known_noise, render};
+use cellpos_vision::{FixQuality, Localiser, LocaliserConfig, ProfileSpec, RingProfile};
 
 const NOISE: f64 = 100.0;
 const SNR: f64 = 40.0;
@@ -14,11 +12,7 @@ const WALL: (usize, u16) = (3, 2_500);
 fn localiser() -> Localiser {
     let config = LocaliserConfig {
         window_px: SIDE,
-        noise: PixelNoise::Known {
-            read_sd_grey: NOISE,
-            shot_grey_per_electron: 0.0,
-            black_level_grey: 0.0,
-        },
+        noise: known_noise(NOISE),
         ..LocaliserConfig::new(ProfileSpec::Ring { edge_px: RING })
     };
     Localiser::new(config).expect("valid settings")

@@ -1,6 +1,6 @@
 //! The localiser against the Cramer-Rao bound, beside methods that need no template.
 
-use crate::common::{BACKGROUND, Errors, Random, SIDE, bound, frame, render};
+use crate::common::{BACKGROUND, Errors, Random, SIDE, bound, frame, known_noise, render};
 use cellpos_vision::{
     FixQuality, GaussianProfile, Learning, Localiser, LocaliserConfig, PixelNoise, Polarity,
     ProfileSpec, RadialProfile, RadialSymmetry, RingProfile,
@@ -8,14 +8,6 @@ use cellpos_vision::{
 
 const NOISE: f64 = 100.0;
 const FRAMES: usize = 2000;
-
-fn known_noise() -> PixelNoise {
-    PixelNoise::Known {
-        read_sd_grey: NOISE,
-        shot_grey_per_electron: 0.0,
-        black_level_grey: 0.0,
-    }
-}
 
 fn profiles() -> [(&'static str, ProfileSpec, Box<dyn RadialProfile>); 2] {
     let edge_px = RingProfile::MEASURED_EDGE_PX;
@@ -45,7 +37,7 @@ fn error_reaches_the_cramer_rao_bound_without_bias() {
         for snr in [10.0, 20.0, 40.0, 80.0] {
             let config = LocaliserConfig {
                 window_px: SIDE,
-                noise: known_noise(),
+                noise: known_noise(NOISE),
                 ..LocaliserConfig::new(spec)
             };
             let mut localiser = Localiser::new(config).unwrap();
@@ -108,7 +100,7 @@ fn bias_stays_below_5_millipixels_in_every_part_of_the_pixel() {
     for (name, spec, profile) in profiles() {
         let config = LocaliserConfig {
             window_px: SIDE,
-            noise: known_noise(),
+            noise: known_noise(NOISE),
             ..LocaliserConfig::new(spec)
         };
         let mut localiser = Localiser::new(config).unwrap();
@@ -212,7 +204,7 @@ fn a_learnt_template_brings_a_wrong_one_to_the_bound() {
     let run = |learning: Option<Learning>| {
         let config = LocaliserConfig {
             window_px: SIDE,
-            noise: known_noise(),
+            noise: known_noise(NOISE),
             learning,
             ..LocaliserConfig::new(spec)
         };
@@ -283,7 +275,7 @@ fn size_of_a_bead_is_measured_relative_to_the_template() {
     for size in [0.95, 1.0, 1.05] {
         let profile = RingProfile::new(size * RingProfile::MEASURED_EDGE_PX).unwrap();
         let mut localiser = Localiser::new(LocaliserConfig {
-            noise: known_noise(),
+            noise: known_noise(NOISE),
             ..LocaliserConfig::new(spec)
         })
         .unwrap();

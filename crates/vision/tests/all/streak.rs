@@ -1,9 +1,9 @@
 //! Beads that move while the shutter is open: their images are streaks, and the fit knows it.
 
-use crate::common::{BACKGROUND, Errors, Random};
+use crate::common::{BACKGROUND, Errors, Random, known_noise};
 use cellpos_vision::{
-    FixQuality, Frame, Localiser, LocaliserConfig, PixelNoise, Pixels, ProfileSpec, RadialProfile,
-    RingProfile, Start,
+    FixQuality, Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec, RadialProfile, RingProfile,
+    Start,
 };
 use nalgebra::{Matrix4, Vector4};
 
@@ -96,11 +96,7 @@ fn bound(p: &RingProfile, way: (f64, f64), snr: f64) -> (f64, f64) {
 fn localiser() -> Localiser {
     let config = LocaliserConfig {
         window_px: WINDOW,
-        noise: PixelNoise::Known {
-            read_sd_grey: NOISE,
-            shot_grey_per_electron: 0.0,
-            black_level_grey: 0.0,
-        },
+        noise: known_noise(NOISE),
         ..LocaliserConfig::new(ProfileSpec::Ring { edge_px: EDGE_PX })
     };
     Localiser::new(config).unwrap()

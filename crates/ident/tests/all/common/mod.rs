@@ -1,7 +1,10 @@
 //! A rig of positions: the discretised plant of cellpos-plant, Brownian motion, drift, localisation noise, and a PI loop.
 
 use cellpos_ident::candidate_model::CandidateModel;
-use cellpos_ident::experiment::{Bench, Row};
+use cellpos_ident::excitation::ExcitationLimits;
+use cellpos_ident::experiment::{Bench, Measured, Plan, Row};
+use cellpos_ident::frequency_response::Settings;
+use cellpos_ident::sampled::Sampling;
 use cellpos_numeric::Random;
 use cellpos_plant::{Complex, DiscretePlant, DiscreteState, Seconds, TransferFunction};
 
@@ -85,4 +88,14 @@ pub(crate) fn expected(delay_s: f64) -> impl Fn(f64) -> (Complex<f64>, Complex<f
         let s = Complex::new(0.0, 2.0 * std::f64::consts::PI * f);
         (h, h * (0.33 + 9.6 / s))
     }
+}
+
+/// Stepped sines on Eq. (6) with a delay of 2 ms, held, and the noise of what lies between them.
+pub(crate) fn measured(lines_hz: &[f64], limits: ExcitationLimits, seed: u64) -> Measured {
+    let plan = Plan::stepped_sines(lines_hz, &expected(0.002), limits, PERIOD_S, 20.0);
+    let mut rig = PositionRig::new(&TransferFunction::eq6(), 0.002, seed);
+    let records = plan.run(&mut rig, 0, |_| {}).unwrap();
+    let sampling = Sampling::held(1.0 / PERIOD_S);
+    plan.analyse_with_noise(&records, &Settings::default(), sampling, false)
+        .unwrap()
 }

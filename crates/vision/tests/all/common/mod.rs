@@ -4,7 +4,7 @@
 pub(crate) mod change;
 pub(crate) mod stack;
 
-use cellpos_vision::{Frame, Pixels, RadialProfile};
+use cellpos_vision::{Frame, PixelNoise, Pixels, RadialProfile};
 use nalgebra::{Matrix4, Vector4};
 
 /// A small generator of uniform and normal numbers (xorshift64*, Box-Muller): the same bits everywhere.
@@ -27,6 +27,15 @@ impl Random {
 pub(crate) const SIDE: usize = 25;
 /// Background of the frames, grey levels.
 pub(crate) const BACKGROUND: f64 = 20_000.0;
+
+/// Noise of a known standard deviation, the same in every pixel.
+pub(crate) fn known_noise(sd_grey: f64) -> PixelNoise {
+    PixelNoise::Known {
+        read_sd_grey: sd_grey,
+        shot_grey_per_electron: 0.0,
+        black_level_grey: 0.0,
+    }
+}
 
 /// A frame of one bead with even noise.
 pub(crate) fn render(
