@@ -247,7 +247,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             (Some(adapter), Some(adapt)) if tick.controls => adapter.cancel_um(adapt),
             _ => 0.0,
         };
-        let (excitation_um, learned_um) = if tick.controls {
+        let (excitation_um, dither_um, learned_um) = if tick.controls {
             // What a feed-forward divided by another gain is more than the law's own.
             let over = 1.0 / driven.feed_forward_gain - 1.0 / gain;
             let learned_um = input.learned_um + over * driven.feed_forward_um + cancel_um;
@@ -256,18 +256,23 @@ impl<L: ControlLaw> ControlLoop<L> {
                 (Some(adapter), Some(adapt)) => adapter.dither_um(adapt),
                 _ => 0.0,
             };
-            let added_um = input.excitation_um + dither_um;
-            (added_um, if usable { learned_um } else { 0.0 })
+            (
+                input.excitation_um,
+                dither_um,
+                if usable { learned_um } else { 0.0 },
+            )
         } else {
-            (0.0, 0.0)
+            (0.0, 0.0, 0.0)
         };
-        let added_um = excitation_um + learned_um;
+        let added_um = excitation_um + dither_um + learned_um;
         let mut output = self.limit(state, input, &tick, &decided, added_um);
         let change_um = driven.feed_forward_um - state.forward_um;
         state.forward_um = driven.feed_forward_um;
+        let limited = output.flags.range_limited || output.flags.slew_limited;
+        output.dither_um = if limited { 0.0 } else { dither_um };
         output.driven = Driven {
             jump_um: self.parts.model.feedthrough * change_um,
-            limited: output.flags.range_limited || output.flags.slew_limited,
+            limited,
             ..driven
         };
         if tick.controls {
@@ -464,6 +469,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         LoopOutput {
             command_um: limited.command_um,
             requested_um,
+            dither_um: 0.0,
             estimate_um: estimate.position_um,
             estimate_sd_um: estimate.position_sd_um,
             predicted_measurement_um: estimate.predicted_measurement_um,

@@ -62,6 +62,8 @@ struct State {
     running_since: u64,
     last_frame: Option<(u64, i64)>,
     stale_in_a_row: u32,
+    /// Until when frames may be old because this machine stalled, ns.
+    caught_up_ns: i64,
     late_in_a_row: u32,
     refused_in_a_row: u32,
     /// Steps of the grid in a row without a position that was used, and the steps among these that count as a loss.
@@ -205,6 +207,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 running_since: 0,
                 last_frame: None,
                 stale_in_a_row: 0,
+                caught_up_ns: i64::MIN,
                 late_in_a_row: 0,
                 refused_in_a_row: 0,
                 blind: 0,

@@ -99,6 +99,31 @@ impl Bead {
     }
 }
 
+/// Fewest frames whose median shows the scene without its beads.
+const FEWEST_FRAMES: usize = 9;
+
+/// Subtracts the median of all frames, pixel by pixel: walls, dust, and beads that rest. False if there are too few frames, or their sizes
+/// differ; then nothing was changed.
+pub(crate) fn take_out_what_stands_still(flats: &mut [Flat]) -> bool {
+    let size = flats.first().map(|flat| (flat.width, flat.height));
+    let alike = |flat: &Flat| Some((flat.width, flat.height)) == size;
+    if flats.len() < FEWEST_FRAMES || !flats.iter().all(alike) {
+        return false;
+    }
+    let pixels = flats.iter().map(|flat| flat.values.len()).min();
+    let mut greys = Vec::with_capacity(flats.len());
+    for pixel in 0..pixels.unwrap_or(0) {
+        greys.clear();
+        greys.extend(flats.iter().map(|flat| flat.values[pixel]));
+        let middle = greys.len() / 2;
+        let (_, &mut still, _) = greys.select_nth_unstable_by(middle, f32::total_cmp);
+        flats
+            .iter_mut()
+            .for_each(|flat| flat.values[pixel] -= still);
+    }
+    true
+}
+
 /// A frame as grey levels above its smooth background.
 pub(crate) struct Flat {
     pub width: usize,

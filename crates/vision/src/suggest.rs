@@ -9,7 +9,7 @@ use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
-use crate::objects::{Bead, Flat, Object, Refused};
+use crate::objects::{self, Bead, Flat, Object, Refused};
 use crate::overlap;
 use crate::range::Range;
 use crate::reach;
@@ -91,10 +91,27 @@ pub enum NothingToSuggest {
 
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
 ///
+/// Where fewer beads than frames stand out, walls and dust may hide them: then what stands still is taken out of the frames, and the
+/// search in which more beads are found counts.
+///
 /// # Errors
 /// Nothing stands out, or what does is not alike, or not round.
 pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
-    let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
+    let mut flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
+    let found = suggest_in(frames, &flats);
+    let taken = |found: &Result<Suggestion, _>| found.as_ref().map_or(0, |found| found.taken);
+    if taken(&found) >= frames.len() || !objects::take_out_what_stands_still(&mut flats) {
+        return found;
+    }
+    let moving = suggest_in(frames, &flats);
+    if taken(&moving) > taken(&found) {
+        moving
+    } else {
+        found
+    }
+}
+
+fn suggest_in(frames: &[Frame], flats: &[Flat]) -> Result<Suggestion, NothingToSuggest> {
     let mut refused = Refused::default();
     let mut objects = Vec::new();
     for (n, flat) in flats.iter().enumerate() {
@@ -117,7 +134,7 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
         // Those that have no common round shape, as pairs of beads in any direction, may hide others that have.
         objects.retain(|o| !alike.contains(o));
         refused.other = total - alike.len();
-        match learn(frames, &flats, (alike, &all), refused) {
+        match learn(frames, flats, (alike, &all), refused) {
             Ok(suggestion) => {
                 return Ok(Suggestion {
                     objects: seen,

@@ -86,7 +86,7 @@ pub fn find(
 fn tried(bench: &Bench, capture: &Capture, found: Suggestion) -> Result<FoundBeads, Failure> {
     let localiser = Localiser::new(found.config.clone()).map_err(Failure::input)?;
     let sight = Sight::of_bead(bench, localiser, &capture.frames)?;
-    if 2 * sight.seen < sight.frames {
+    if 2 * sight.seen < sight.frames.max(1) {
         return Err(Failure::Failed(miette::miette!(
             help = "the picture shows what was taken for beads: are they in focus, alone, and nothing else of that size? Record them \
                     (cellpos camera --rig RIG --record beads/) and see what cellpos vision beads/ says of each",

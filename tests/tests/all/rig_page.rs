@@ -83,7 +83,8 @@ fn followed(seed: u64, look: Option<&str>) -> Result<Ended, String> {
             true => line.replace("5s", "20s") + " --json",
             false => line.clone(),
         };
-        let found = (is("calibrate") && look.is_some()).then(|| {
+        // The page's next step where the camera shows no bead that vision believes in.
+        let found = (is("camera") && look.is_some()).then(|| {
             "cellpos camera --rig rig.toml --find-beads beads.png --duration 3s".to_string()
         });
         for line in found.into_iter().chain([line]) {

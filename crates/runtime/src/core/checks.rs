@@ -24,6 +24,13 @@ impl<R: ReferenceGenerator> Core<R> {
         tick.disturbed = true;
         tick.event(EventKind::TicksSkipped { count: skipped });
         self.state.counts.skipped += skipped;
+        let stalled_ns = i64::try_from(skipped)
+            .unwrap_or(LONGEST_NS)
+            .saturating_mul(self.timing.period_ns());
+        self.state.caught_up_ns = tick
+            .time_ns
+            .saturating_add(stalled_ns.min(LONGEST_NS))
+            .saturating_add(Timing::ms_to_ns(self.timing.oldest_ms));
         let most = (LONGEST_NS / self.timing.period_ns()).max(1).unsigned_abs();
         if skipped > most {
             self.latch(SafeReason::Stalled, tick);
@@ -84,7 +91,11 @@ impl<R: ReferenceGenerator> Core<R> {
             if input.frames.refused() > 0 && input.frames.backlog == 0 {
                 tick.flags.set(TickFlags::STALE);
                 tick.disturbed = true;
-                self.state.stale_in_a_row = self.state.stale_in_a_row.saturating_add(1);
+                // What was exposed while this machine stalled is old for that reason. It is through once the camera's path, which is
+                // faster than its frames come, has had as long as the stall was; a frame may take `oldest_ms` of its own.
+                if tick.time_ns >= self.state.caught_up_ns {
+                    self.state.stale_in_a_row = self.state.stale_in_a_row.saturating_add(1);
+                }
                 if self.state.stale_in_a_row >= self.timing.faults_in_a_row {
                     let slow = self.state.vision_slow_since_ns.is_some();
                     let reason = if slow {

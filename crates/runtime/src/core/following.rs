@@ -13,14 +13,19 @@
 //! A picture that shakes and an actuator that rings move the bead in no hypothesis of these. A wrong sign must then predict the motion
 //! better than its mere size does.
 //!
+//! An actuator that clips just beside zero flow still lets the loop hold, more loosely. There the random part of the commands tells:
+//! see [`one_sided`].
+//!
 //! Limit: a flow of more than 2 um that rises within 40 ms (1 % to 99 %) grows just as a loop with a wrong sign does, and can be taken
 //! for one.
 
 mod belief;
+mod one_sided;
 
 use crate::keeping::Hold;
 use belief::{Belief, Noise, Path};
 use cellpos_control::{EstimatorConfig, LoopModel};
+use one_sided::{Moved, OneSided};
 
 /// Natural logarithm of the odds that are asked for. Where a model is exact, Page's test is wrong once in e^32 ticks, 2,500 years at 1 kHz;
 /// e^20 would do for a year. The rest is for flows that rise as no model here does: evidence of a wrong sign grows with the square of an
@@ -61,6 +66,8 @@ pub(super) enum Instead {
     Against,
     /// It does not feel them.
     Adrift,
+    /// It feels those on one side of zero flow only, and is held.
+    OneSided,
 }
 
 /// A pause of the loop: where its PZT rests, um, ticks since it began, and the evidence before its command showed.
@@ -162,6 +169,8 @@ pub(super) struct Seen {
     pub reference_um: f64,
     /// The command of this tick, which shows one delay later.
     pub command_um: f64,
+    /// Its random part.
+    pub dither_um: f64,
     /// Zero flow of the last quiet time.
     pub zero_flow_um: f64,
 }
@@ -183,6 +192,8 @@ pub(super) struct Following {
     /// Newest commands first, um, and how many there are.
     commands_um: [f64; COMMANDS],
     known: usize,
+    dithers_um: [f64; COMMANDS],
+    one_sided: OneSided,
     mean_um: f64,
     mean_share: f64,
     shake_share: f64,
@@ -224,6 +235,8 @@ impl Following {
             away_ticks: AWAY_DELAYS * delay_and_hold_s / sample_s,
             commands_um: [0.0; COMMANDS],
             known: 0,
+            dithers_um: [0.0; COMMANDS],
+            one_sided: OneSided::new(sample_s),
             mean_um: 0.0,
             mean_share: (sample_s / MEAN_S).min(1.0),
             shake_share: (sample_s / SHAKE_S).min(1.0),
@@ -250,15 +263,16 @@ impl Following {
             fix: None,
             reference_um: f64::NAN,
             command_um: held_um,
+            dither_um: self.dithers_um[0],
             zero_flow_um: f64::NAN,
         });
     }
 
     /// The displacement that moved the bead from the last fix to that of this tick, in the mean, and its change with a tick of delay, um:
     /// unless fixes are a whole number of ticks old, the command changed meanwhile. `None` while too few commands are known.
-    fn shown_um(&self) -> Option<(f64, f64)> {
+    fn shown_um(&self, commands_um: &[f64; COMMANDS]) -> Option<(f64, f64)> {
         let (whole, part) = self.age;
-        let newest = self.commands_um.get(whole + 1..whole + 3);
+        let newest = commands_um.get(whole + 1..whole + 3);
         let &[now_um, before_um] = newest.filter(|_| self.known > whole + 2)? else {
             return None;
         };
@@ -271,10 +285,15 @@ impl Following {
         if self.gain == 0.0 {
             return None;
         }
-        self.commands_um.copy_within(..COMMANDS - 1, 1);
-        self.commands_um[0] = seen.command_um;
+        for (past_um, newest_um) in [
+            (&mut self.commands_um, seen.command_um),
+            (&mut self.dithers_um, seen.dither_um),
+        ] {
+            past_um.copy_within(..COMMANDS - 1, 1);
+            past_um[0] = newest_um;
+        }
         self.known = (self.known + 1).min(COMMANDS);
-        let Some((now_um, change_um)) = self.shown_um() else {
+        let Some((now_um, change_um)) = self.shown_um(&self.commands_um) else {
             self.mean_um = seen.command_um;
             return None;
         };
@@ -298,6 +317,7 @@ impl Following {
                 pause.ticks = pause.ticks.saturating_add(1);
             }
         }
+        let (dithered_um, _) = self.shown_um(&self.dithers_um)?;
         let (position_um, variance_um2) = seen.fix?;
         let ticks = std::mem::take(&mut self.since_fix).max(1.0);
         let zero_flow_um = seen.zero_flow_um;
@@ -315,6 +335,14 @@ impl Following {
             });
             return None;
         };
+        if ticks == 1.0 {
+            self.one_sided.step(&Moved {
+                bead_um: position_um - beliefs.before_um,
+                usual_um2: beliefs.motion_um2,
+                dither_um: self.gain * dithered_um,
+                above: now_um - dithered_um > zero_flow_um,
+            });
+        }
         let off_um = (position_um - seen.reference_um).abs();
         let is_away = off_um > self.hold.limit_um(variance_um2);
         if is_away {
@@ -357,7 +385,10 @@ impl Following {
             }
         }
         let goes = adrift.evidence > EVIDENCE && beliefs.compared.2;
-        goes.then_some((Instead::Adrift, beliefs.adrift.zero_flow_um))
+        if goes {
+            return Some((Instead::Adrift, adrift.zero_flow_um));
+        }
+        (self.one_sided.told()).then_some((Instead::OneSided, zero_flow_um))
     }
 }
 

@@ -64,7 +64,8 @@ impl<R: ReferenceGenerator> Core<R> {
         self.state.rest.step(&seen, output.flags);
     }
 
-    /// A bead that moves against the commands, or follows them up to a level and no further, is frozen at the zero flow of before.
+    /// A bead that moves against the commands, or follows them up to a level and no further, is frozen at the zero flow of before. One that
+    /// the loop holds although it follows on one side only is held on; the run says it.
     pub(super) fn watch_following(
         &mut self,
         fix: Option<LoopMeasurement>,
@@ -90,12 +91,19 @@ impl<R: ReferenceGenerator> Core<R> {
             fix: on_time.map(|fix| (fix.position_um, fix.variance_um2)),
             reference_um,
             command_um: output.command_um,
+            dither_um: output.dither_um,
             zero_flow_um: state.rest.zero_flow().um,
         });
         let pauses = state.following.pause_um().is_some();
         state.pauses.step(pauses, tick);
         match found {
             None => {}
+            Some((Instead::OneSided, level_um)) => {
+                if !std::mem::replace(&mut state.clipped, true) {
+                    tick.flags.set(TickFlags::CLIPPED);
+                    tick.event(EventKind::ActuatorClipped { level_um });
+                }
+            }
             Some((Instead::Against, rest_um)) => {
                 self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
             }

@@ -19,6 +19,10 @@ pub(super) struct Peers {
     pub(super) half_the_rate_ns: Option<(i64, i64)>,
     /// Each so many ns the camera is silent for so long, and delivers at once what it has.
     pub(super) silences_ns: Option<(i64, i64)>,
+    /// Frames that come from one time to another are so much later, in their order.
+    pub(super) frames_late_ns: Option<([i64; 2], i64)>,
+    /// From one time to another the machine does not run the control thread.
+    pub(super) stall_ns: Option<[i64; 2]>,
 }
 
 impl Peers {
@@ -36,6 +40,12 @@ impl Peers {
 
     /// When a frame arrives.
     pub(super) fn arrival_ns(&self, arrives_ns: i64) -> i64 {
+        let arrives_ns = match self.frames_late_ns {
+            Some(([from_ns, to_ns], by_ns)) if arrives_ns >= from_ns => {
+                arrives_ns.max((arrives_ns + by_ns).min(to_ns + by_ns))
+            }
+            _ => arrives_ns,
+        };
         match self.silences_ns {
             Some((every_ns, silence_ns)) => {
                 arrives_ns.max(arrives_ns / every_ns * every_ns + silence_ns)
@@ -198,6 +208,30 @@ fn a_camera_whose_clock_runs_or_steps_back_is_noticed() {
         reason(&with(4, peers, 1000.0)),
         Some(SafeReason::StaleFrames)
     );
+}
+
+#[test]
+fn old_frames_end_a_run_unless_the_machine_stalled_just_before() {
+    let at_ns = 2000 * MS;
+    for stall_ms in [0, 3, 20, 60] {
+        // The frames of the stall come with it, and as long afterwards.
+        let late_ms = 2 * stall_ms.max(8);
+        let peers = Peers {
+            stall_ns: Some([at_ns, at_ns + stall_ms * MS]),
+            frames_late_ns: Some(([at_ns, at_ns + late_ms * MS], 5 * MS)),
+            ..Peers::default()
+        };
+        let expected = (stall_ms < 20).then_some(SafeReason::StaleFrames);
+        assert_eq!(reason(&with(6, peers, 1000.0)), expected, "{stall_ms} ms");
+    }
+    // Those that stay old end it all the same.
+    let peers = Peers {
+        stall_ns: Some([at_ns, at_ns + 40 * MS]),
+        frames_late_ns: Some(([at_ns, 3500 * MS], 5 * MS)),
+        ..Peers::default()
+    };
+    let ends = reason(&with(7, peers, 1000.0));
+    assert_eq!(ends, Some(SafeReason::StaleFrames));
 }
 
 #[test]

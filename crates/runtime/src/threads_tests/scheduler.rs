@@ -81,6 +81,10 @@ impl Scheduler<'_> {
         } else {
             0
         };
+        let stalled = (self.faults.peers.stall_ns).filter(|[from_ns, to_ns]| {
+            who == 1 && (self.start_ns + from_ns..self.start_ns + to_ns).contains(&due_ns)
+        });
+        let late_ns = stalled.map_or(late_ns, |[_, to_ns]| self.start_ns + to_ns - due_ns);
         let clock = self.clocks[who].clone();
         clock.sleep_until_ns(due_ns + late_ns);
         match who {

@@ -18,6 +18,8 @@ struct World<'a> {
     reference: &'a dyn Fn(f64) -> f64,
     /// What is added to the command, um.
     added: &'a dyn Fn(f64) -> f64,
+    /// Side of the dither, um of command, which changes at random every second tick.
+    dither_um: f64,
     /// What the picture shakes by, um.
     shakes: &'a dyn Fn(f64) -> f64,
     /// Frequency \[Hz\] and damping of an actuator that rings.
@@ -39,6 +41,7 @@ impl Default for World<'_> {
             zero_flow: &|_| 20.0,
             reference: &|_| 0.0,
             added: &|_| 0.0,
+            dither_um: 0.0,
             shakes: &|_| 0.0,
             rings: None,
             lost: &|_| false,
@@ -65,6 +68,7 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
     let mut seen = std::collections::VecDeque::from(vec![0.0; late + 2]);
     let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
+    let mut side_um = 0.0;
     for k in 0..(world.seconds * world.rate_hz) as u64 {
         let t = k as f64 * dt;
         let [low_um, high_um] = (world.range)(t);
@@ -97,13 +101,19 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
         zero_um -= 8.0 * dt * error_um;
-        let driven_um = zero_um - 0.4 * error_um + (world.added)(t);
+        let before_um = side_um;
+        if k % 2 == 0 && world.dither_um > 0.0 {
+            side_um = world.dither_um * noise(&mut state).signum();
+        }
+        let dither_um = side_um - before_um;
+        let driven_um = zero_um - 0.4 * error_um + (world.added)(t) + dither_um;
         command_um = following.pause_um().unwrap_or(driven_um);
         command_um = command_um.clamp(0.0, 40.0);
         let found = following.step(&Seen {
             fix: Some((fix_um, 0.015_f64.powi(2))),
             reference_um,
             command_um,
+            dither_um,
             zero_flow_um: zero_um,
         });
         if let Some((instead, _)) = found {
@@ -214,6 +224,57 @@ fn an_actuator_that_clips_near_zero_flow_is_told_under_a_slow_law_within_20_um()
                 s >= 3.0 && um.abs() < 20.0 && instead == Instead::Adrift
             });
             assert!(in_time, "{level_um} um, seed {seed}: {found:?}");
+        }
+    }
+}
+
+/// Side of a dither that moves the bead 3.6 nm from the middle, um of command.
+const DITHER_UM: f64 = 3.6e-3 / 0.38;
+
+#[test]
+fn an_actuator_that_follows_on_one_side_only_is_told_from_the_dither() {
+    for (above, axis) in [(true, 1.0), (false, 1.0), (true, -1.0)] {
+        for beside_um in [0.0, 0.01] {
+            for seed in 1..=3 {
+                let range = |t: f64| match (t > 20.0, above) {
+                    (false, _) => [0.0, 40.0],
+                    (true, true) => [0.0, 20.0 + beside_um],
+                    (true, false) => [20.0 - beside_um, 40.0],
+                };
+                let found = found_by(&World {
+                    seed,
+                    axis,
+                    range: &range,
+                    dither_um: DITHER_UM,
+                    seconds: 50.0,
+                    ..World::default()
+                });
+                let in_time = found.is_some_and(|(s, um, _)| s >= 20.0 && um.abs() < 5.0);
+                assert!(in_time, "{above}, {beside_um} um, seed {seed}: {found:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn flows_that_pulse_one_way_leave_no_side_without_an_answer() {
+    let strokes = |t: f64| 20.0 + 1.5 * (-(t * 1.4).fract() / 0.05).exp();
+    let hum = |t: f64| 20.0 + 0.5 * (std::f64::consts::TAU * 50.0 * t).sin();
+    let swings = |t: f64| 20.0 + 1.0 * (std::f64::consts::TAU * 3.0 * t).sin();
+    let flows: [&dyn Fn(f64) -> f64; 4] = [&|_| 20.0, &strokes, &hum, &swings];
+    for (n, zero_flow) in flows.into_iter().enumerate() {
+        for gain in [0.5, 1.0, 2.0] {
+            for seed in 1..=2 {
+                let found = found_by(&World {
+                    seed,
+                    gain_ratio: &|_| gain,
+                    zero_flow,
+                    dither_um: DITHER_UM,
+                    seconds: 60.0,
+                    ..World::default()
+                });
+                assert_eq!(found, None, "flow {n}, gain {gain}, seed {seed}");
+            }
         }
     }
 }

@@ -186,6 +186,24 @@ fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sig
 }
 
 #[test]
+fn an_amplifier_that_clips_just_above_zero_flow_is_said_though_the_bead_is_held() {
+    for (seed, law) in LAWS.into_iter().enumerate() {
+        for clip_um in [20.01, 20.02] {
+            let row = Row {
+                seconds: 20.0,
+                ideal: false,
+                ..Row::clipped(law, clip_um)
+            };
+            let held = hold(&row, 11 + seed as u64);
+            println!("{row}, {clip_um} um | {held} | {}", held.ended);
+            assert_eq!(held.why.as_deref(), Some("clipped"), "{row}: {held}");
+            assert!(held.ended.contains("is clipped"), "{row}: {}", held.ended);
+            assert!(!held.as_asked, "{row}: {}", held.ended);
+        }
+    }
+}
+
+#[test]
 fn steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms_under_every_law() {
     for (law, count, most_ms) in [
         ("lqg", 100, 12.0),
