@@ -70,11 +70,12 @@ impl OneSided {
 
     pub(super) fn step(&mut self, moved: &Moved) {
         let spread_um2 = moved.usual_um2;
-        let furthest_um = FURTHEST * spread_um2.sqrt();
-        let bead_um = (moved.bead_um - self.drift_um).clamp(-furthest_um, furthest_um);
-        if !bead_um.is_finite() {
+        let finite = [moved.bead_um, moved.dither_um, spread_um2];
+        if !finite.into_iter().all(f64::is_finite) || spread_um2 <= 0.0 {
             return;
         }
+        let furthest_um = FURTHEST * spread_um2.sqrt();
+        let bead_um = (moved.bead_um - self.drift_um).clamp(-furthest_um, furthest_um);
         self.drift_um += bead_um / DRIFT_TICKS;
         let [below, above] = &mut self.sides;
         let (side, other) = if moved.above {
