@@ -2,8 +2,9 @@
 //! the flow the other: the loop holds, but more loosely, and loses the bead at the next change of the flow.
 //!
 //! Commands answer the flow, so what the bead does under them says little. Their random part (the dither) does not: the bead's motion
-//! that goes with it gives the gain, apart for commands above and below zero flow. On each side two hypotheses are weighed: the bead
-//! follows as it does on the other side, or not at all. Page's test finds the time from which the second is the better one.
+//! that goes with it gives the gain, apart for commands above and below zero flow. Three hypotheses are weighed: the bead follows on both
+//! sides, on one only, or on none, as it seems to when the delay changes. Page's test finds the time from which the second is better than
+//! the first; since then it must be better than the third as well.
 
 /// Natural logarithm of the odds that are asked for. Page's test on a loop that follows comes back to zero within a second, and is wrong
 /// once in e^16 of such times, a hundred days. A dither that costs 1 % of a hold reaches it in 7 s.
@@ -34,8 +35,8 @@ struct Side {
     /// Sums of dither times motion and of dither squared, um^2.
     moved_um2: f64,
     dithered_um2: f64,
-    /// For a bead that does not follow, natural logarithm of the odds.
-    evidence: f64,
+    /// That the bead follows on the other side only, against both sides and against none, natural logarithms of the odds.
+    evidence: [f64; 2],
 }
 
 impl Side {
@@ -47,6 +48,11 @@ impl Side {
         let sd = (spread_um2 / self.dithered_um2).sqrt();
         (self.moved_um2 / self.dithered_um2 - DOUBT * sd).max(0.0)
     }
+}
+
+/// How much likelier it is that the bead went `bead_um` by itself than that it followed by `follows_um`, natural logarithm of the odds.
+fn odds_of_none(bead_um: f64, follows_um: f64, spread_um2: f64) -> f64 {
+    follows_um * (0.5 * follows_um - bead_um) / spread_um2
 }
 
 /// The watch over both sides.
@@ -83,15 +89,21 @@ impl OneSided {
         } else {
             (below, above)
         };
-        let follows_um = other.least_gain(spread_um2) * moved.dither_um;
-        let odds = follows_um * (0.5 * follows_um - bead_um) / spread_um2;
-        side.evidence = (side.evidence + odds).max(0.0);
+        let gains = [&*other, &*side].map(|side| side.least_gain(spread_um2));
+        let [none, own] =
+            gains.map(|gain| odds_of_none(bead_um, gain * moved.dither_um, spread_um2));
+        side.evidence[0] += none;
+        if side.evidence[0] <= 0.0 {
+            side.evidence = [0.0; 2];
+        }
+        other.evidence[1] -= own;
         side.moved_um2 = self.kept * side.moved_um2 + moved.dither_um * bead_um;
         side.dithered_um2 = self.kept * side.dithered_um2 + moved.dither_um * moved.dither_um;
     }
 
     /// Whether the bead follows on one side only.
     pub(super) fn told(&self) -> bool {
-        self.sides.iter().any(|side| side.evidence > EVIDENCE)
+        let told = |side: &Side| side.evidence.iter().all(|odds| *odds > EVIDENCE);
+        self.sides.iter().any(told)
     }
 }

@@ -12,6 +12,8 @@ struct World<'a> {
     rate_hz: f64,
     /// Age of a fix at its tick, s.
     late_s: f64,
+    /// When fixes become a tick older than that, s.
+    later_s: f64,
     /// Displacements that the actuator gives, um.
     range: &'a dyn Fn(f64) -> [f64; 2],
     zero_flow: &'a dyn Fn(f64) -> f64,
@@ -37,6 +39,7 @@ impl Default for World<'_> {
             axis: 1.0,
             rate_hz: 1000.0,
             late_s: 2e-3,
+            later_s: f64::INFINITY,
             range: &|_| [0.0, 40.0],
             zero_flow: &|_| 20.0,
             reference: &|_| 0.0,
@@ -66,7 +69,7 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
     let late = world.late_s * world.rate_hz;
     let (late, part) = (late.round() as usize, late - late.round());
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
-    let mut seen = std::collections::VecDeque::from(vec![0.0; late + 2]);
+    let mut seen = std::collections::VecDeque::from(vec![0.0; late + 3]);
     let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
     let mut side_um = 0.0;
     for k in 0..(world.seconds * world.rate_hz) as u64 {
@@ -95,8 +98,13 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
             continue;
         }
         // Behind the newest by a whole number of ticks, and a part of one before or after that.
-        let other = if part > 0.0 { seen[0] } else { seen[2] };
-        let shown_um = seen[1] + part.abs() * (other - seen[1]);
+        let at = if t < world.later_s { 2 } else { 1 };
+        let other = if part > 0.0 {
+            seen[at - 1]
+        } else {
+            seen[at + 1]
+        };
+        let shown_um = seen[at] + part.abs() * (other - seen[at]);
         let fix_um = shown_um + (world.shakes)(t) + 0.015 * noise(&mut state);
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
@@ -224,6 +232,23 @@ fn an_actuator_that_clips_near_zero_flow_is_told_under_a_slow_law_within_20_um()
                 s >= 3.0 && um.abs() < 20.0 && instead == Instead::Adrift
             });
             assert!(in_time, "{level_um} um, seed {seed}: {found:?}");
+        }
+    }
+}
+
+#[test]
+fn a_delay_that_grows_by_a_tick_leaves_no_side_without_an_answer() {
+    for gain in [0.6, 1.0, 1.4] {
+        for seed in 1..=4 {
+            let found = found_by(&World {
+                seed,
+                gain_ratio: &|_| gain,
+                later_s: 20.0,
+                dither_um: DITHER_UM,
+                seconds: 60.0,
+                ..World::default()
+            });
+            assert_eq!(found, None, "gain {gain}, seed {seed}");
         }
     }
 }
