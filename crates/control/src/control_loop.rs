@@ -243,26 +243,20 @@ impl<L: ControlLaw> ControlLoop<L> {
         let own_um = decided.wish_um;
         decided.wish_um += driven.feed_forward_um;
         // The part that cancels a line in the flow is hidden from the estimator like the learned part: the bead shows neither.
-        let cancel_um = match (&self.adapter, &state.adapt) {
-            (Some(adapter), Some(adapt)) if tick.controls => adapter.cancel_um(adapt),
-            _ => 0.0,
+        let (cancel_um, dither_um) = match (&self.adapter, &state.adapt) {
+            (Some(adapter), Some(adapt)) if tick.controls => {
+                (adapter.cancel_um(adapt), adapter.dither_um(adapt))
+            }
+            _ => (0.0, 0.0),
         };
-        let (excitation_um, dither_um, learned_um) = if tick.controls {
+        let (excitation_um, learned_um) = if tick.controls {
             // What a feed-forward divided by another gain is more than the law's own.
             let over = 1.0 / driven.feed_forward_gain - 1.0 / gain;
             let learned_um = input.learned_um + over * driven.feed_forward_um + cancel_um;
             let usable = learned_um.is_finite();
-            let dither_um = match (&self.adapter, &state.adapt) {
-                (Some(adapter), Some(adapt)) => adapter.dither_um(adapt),
-                _ => 0.0,
-            };
-            (
-                input.excitation_um,
-                dither_um,
-                if usable { learned_um } else { 0.0 },
-            )
+            (input.excitation_um, if usable { learned_um } else { 0.0 })
         } else {
-            (0.0, 0.0, 0.0)
+            (0.0, 0.0)
         };
         let added_um = excitation_um + dither_um + learned_um;
         let mut output = self.limit(state, input, &tick, &decided, added_um);

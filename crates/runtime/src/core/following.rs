@@ -280,11 +280,7 @@ impl Following {
         Some((now_um + part * change_um, change_um))
     }
 
-    /// Takes in a tick. Gives what the bead does instead of following the commands, and the displacement at which it rested before, um.
-    pub(super) fn step(&mut self, seen: &Seen) -> Option<(Instead, f64)> {
-        if self.gain == 0.0 {
-            return None;
-        }
+    fn remember(&mut self, seen: &Seen) {
         for (past_um, newest_um) in [
             (&mut self.commands_um, seen.command_um),
             (&mut self.dithers_um, seen.dither_um),
@@ -293,6 +289,14 @@ impl Following {
             past_um[0] = newest_um;
         }
         self.known = (self.known + 1).min(COMMANDS);
+    }
+
+    /// Takes in a tick. Gives what the bead does instead of following the commands, and the displacement at which it rested before, um.
+    pub(super) fn step(&mut self, seen: &Seen) -> Option<(Instead, f64)> {
+        if self.gain == 0.0 {
+            return None;
+        }
+        self.remember(seen);
         let Some((now_um, change_um)) = self.shown_um(&self.commands_um) else {
             self.mean_um = seen.command_um;
             return None;

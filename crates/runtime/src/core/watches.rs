@@ -98,11 +98,11 @@ impl<R: ReferenceGenerator> Core<R> {
         state.pauses.step(pauses, tick);
         match found {
             None => {}
+            Some((Instead::OneSided, _)) if state.clipped => {}
             Some((Instead::OneSided, level_um)) => {
-                if !std::mem::replace(&mut state.clipped, true) {
-                    tick.flags.set(TickFlags::CLIPPED);
-                    tick.event(EventKind::ActuatorClipped { level_um });
-                }
+                state.clipped = true;
+                tick.flags.set(TickFlags::CLIPPED);
+                tick.event(EventKind::ActuatorClipped { level_um });
             }
             Some((Instead::Against, rest_um)) => {
                 self.freeze_at(FreezeReason::NotFollowing, rest_um, tick);
