@@ -24,14 +24,10 @@ impl<R: ReferenceGenerator> Core<R> {
         tick.disturbed = true;
         tick.event(EventKind::TicksSkipped { count: skipped });
         self.state.counts.skipped += skipped;
-        let stalled_ns = i64::try_from(skipped)
-            .unwrap_or(LONGEST_NS)
-            .saturating_mul(self.timing.period_ns());
-        self.state.caught_up_ns = tick
-            .time_ns
-            .saturating_add(stalled_ns.min(LONGEST_NS))
-            .saturating_add(Timing::ms_to_ns(self.timing.oldest_ms));
         let most = (LONGEST_NS / self.timing.period_ns()).max(1).unsigned_abs();
+        let stalled_ns = skipped.min(most).cast_signed() * self.timing.period_ns();
+        self.state.caught_up_ns =
+            tick.time_ns + stalled_ns + Timing::ms_to_ns(self.timing.oldest_ms);
         if skipped > most {
             self.latch(SafeReason::Stalled, tick);
         }
@@ -91,8 +87,8 @@ impl<R: ReferenceGenerator> Core<R> {
             if input.frames.refused() > 0 && input.frames.backlog == 0 {
                 tick.flags.set(TickFlags::STALE);
                 tick.disturbed = true;
-                // What was exposed while this machine stalled is old for that reason. It is through once the camera's path, which is
-                // faster than its frames come, has had as long as the stall was; a frame may take `oldest_ms` of its own.
+                // A stall of this machine makes frames old, not the camera. The camera's path delivers faster than the camera exposes, so
+                // these frames have come when the stall is over for as long as it lasted. The last one may still take `oldest_ms`.
                 if tick.time_ns >= self.state.caught_up_ns {
                     self.state.stale_in_a_row = self.state.stale_in_a_row.saturating_add(1);
                 }

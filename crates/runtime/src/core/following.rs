@@ -13,8 +13,8 @@
 //! A picture that shakes and an actuator that rings move the bead in no hypothesis of these. A wrong sign must then predict the motion
 //! better than its mere size does.
 //!
-//! An actuator that clips just beside zero flow still lets the loop hold, more loosely. There the random part of the commands tells:
-//! see [`one_sided`].
+//! An actuator may clip close to zero flow. The loop then still holds the bead, but more loosely. The dither shows the clip: see
+//! [`one_sided`].
 //!
 //! Limit: a flow of more than 2 um that rises within 40 ms (1 % to 99 %) grows just as a loop with a wrong sign does, and can be taken
 //! for one.
