@@ -65,6 +65,8 @@ pub struct Tracker {
     streak_px: (f64, f64),
     exposure_s: f64,
     candidates: [Option<Candidate>; MAX_BEADS],
+    /// Where else light was seen when the chosen bead was last taken among others, px.
+    stood_px: [Option<(f64, f64)>; MAX_BEADS],
     /// Share of what may be that the last fixes have used, and whether the end is near.
     used: f64,
     near_limit: bool,
@@ -91,6 +93,7 @@ impl Tracker {
             streak_px: (0.0, 0.0),
             exposure_s: 0.0,
             candidates: [None; MAX_BEADS],
+            stood_px: [None; MAX_BEADS],
             used: 0.0,
             near_limit: false,
         })
@@ -112,6 +115,7 @@ impl Tracker {
         self.aim = aim;
         self.chosen = None;
         self.neighbours = Neighbours::default();
+        self.stood_px = [None; MAX_BEADS];
         self.standing.state = TrackState::Searching;
     }
 
@@ -360,6 +364,7 @@ impl Tracker {
                     chosen
                 };
                 self.take(restarted, &c, time_s);
+                self.remember_what_stands(&c);
                 (decision, Some(c.fix))
             }
             (None, Some(_)) => (Decision::Ambiguous, nearest),

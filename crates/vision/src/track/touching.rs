@@ -1,5 +1,6 @@
 //! Beads whose images overlap: what one template fits badly is fitted as several beads, and a flow carries them alike.
 
+use super::carried::stood;
 use super::neighbours::{Candidate, MAX_BEADS};
 use super::{Chosen, Tracker};
 use crate::fix::FixQuality;
@@ -90,7 +91,14 @@ impl Tracker {
         let mut together = self.localiser.locate_together(frame, starts);
         if !together.is_some_and(|t| t.all_seen()) {
             // A step of the flow that has carried the chosen bead to one of them draws every image out.
-            let carried = |from: Chosen| starts.iter().map(move |to| way(from, to.place_px));
+            let (stood_px, radius_px) = (self.stood_px, self.localiser.template().radius_px());
+            let came = |to: &&Start| !stood(&stood_px, to.place_px, radius_px);
+            let carried = |from| {
+                starts
+                    .iter()
+                    .filter(came)
+                    .map(move |to| way(from, to.place_px))
+            };
             for way_px in self.chosen.into_iter().flat_map(carried) {
                 let fitted = self.locate_carried(frame, starts, way_px);
                 together = fitted.filter(Together::all_seen).or(together);
