@@ -26,7 +26,7 @@ impl Tracker {
             let from = chosen.motion.position();
             let way = (c.seen_px.0 - from.0, c.seen_px.1 - from.1);
             let along_px = f64::hypot(way.0, way.1) * self.exposure_s / since_s;
-            if good(&c) || along_px < STREAK_PX || stood(&self.stood_px, c.seen_px, radius_px) {
+            if good(&c) || along_px < STREAK_PX || self.beside.stood(c.seen_px, radius_px) {
                 continue;
             }
             let share = self.exposure_s / since_s;
@@ -59,21 +59,4 @@ impl Tracker {
             self.add_candidate(c);
         }
     }
-
-    /// Remembers where light is seen that is not the chosen bead, which is at `ours`.
-    pub(super) fn remember_what_stands(&mut self, ours: &Candidate) {
-        let radius_px = self.localiser.template().radius_px();
-        let others = self.candidates.iter().flatten().map(|c| c.seen_px);
-        let mut others =
-            others.filter(|(x, y)| f64::hypot(x - ours.fix.x_px, y - ours.fix.y_px) > radius_px);
-        self.stood_px = core::array::from_fn(|_| others.next());
-    }
-}
-
-/// Whether something stood at a place when the bead was seen elsewhere: no flow has carried the bead there.
-pub(super) fn stood(places_px: &[Option<(f64, f64)>], (x, y): (f64, f64), radius_px: f64) -> bool {
-    places_px
-        .iter()
-        .flatten()
-        .any(|p| f64::hypot(p.0 - x, p.1 - y) < radius_px)
 }

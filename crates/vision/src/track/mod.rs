@@ -7,6 +7,7 @@
 //! which it belongs to the other is less likely by a set margin. Otherwise the tracker coasts and, after its limit, is
 //! lost: being lost is an answer, following another bead is not.
 
+mod beside;
 mod carried;
 mod cell;
 mod config;
@@ -22,6 +23,7 @@ use crate::detector::Detector;
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
+use beside::Beside;
 pub use cell::{CellStep, CellTracker};
 pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;
@@ -65,8 +67,8 @@ pub struct Tracker {
     streak_px: (f64, f64),
     exposure_s: f64,
     candidates: [Option<Candidate>; MAX_BEADS],
-    /// Where else light was seen when the chosen bead was last taken among others, px.
-    stood_px: [Option<(f64, f64)>; MAX_BEADS],
+    /// What else was seen when the chosen bead was last taken among others.
+    beside: Beside,
     /// Share of what may be that the last fixes have used, and whether the end is near.
     used: f64,
     near_limit: bool,
@@ -93,7 +95,7 @@ impl Tracker {
             streak_px: (0.0, 0.0),
             exposure_s: 0.0,
             candidates: [None; MAX_BEADS],
-            stood_px: [None; MAX_BEADS],
+            beside: Beside::default(),
             used: 0.0,
             near_limit: false,
         })
@@ -115,7 +117,7 @@ impl Tracker {
         self.aim = aim;
         self.chosen = None;
         self.neighbours = Neighbours::default();
-        self.stood_px = [None; MAX_BEADS];
+        self.beside = Beside::default();
         self.standing.state = TrackState::Searching;
     }
 
@@ -364,7 +366,7 @@ impl Tracker {
                     chosen
                 };
                 self.take(restarted, &c, time_s);
-                self.remember_what_stands(&c);
+                self.remember_beside(&c);
                 (decision, Some(c.fix))
             }
             (None, Some(_)) => (Decision::Ambiguous, nearest),

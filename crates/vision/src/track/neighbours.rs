@@ -41,7 +41,7 @@ pub(crate) enum Claim {
 }
 
 /// Whether a fix tells where a neighbour is: one cut by the border still does, a place outside the frame does not.
-fn is_sight(fix: &Fix) -> bool {
+pub(super) fn is_sight(fix: &Fix) -> bool {
     matches!(fix.verdict, FixQuality::Good | FixQuality::AtBorder) && fix.amplitude != 0.0
 }
 
@@ -98,9 +98,19 @@ pub(crate) struct Neighbours {
 type Candidates = [Option<Candidate>; MAX_BEADS];
 
 impl Neighbours {
-    /// Predicted positions (px) and amplitudes (grey levels) of the neighbours of a bead that moves as `ours`.
-    pub(super) fn predictions(&self, ours: &Motion) -> impl Iterator<Item = (f64, f64, f64)> {
-        self.beads.iter().flatten().map(|n| {
+    /// Predicted positions (px) and amplitudes (grey levels) of the neighbours of a bead that moves as `ours`, as far as they have
+    /// been seen often enough.
+    pub(super) fn confirmed(
+        &self,
+        ours: &Motion,
+        config: &TrackerConfig,
+    ) -> impl Iterator<Item = (f64, f64, f64)> {
+        let surely = self
+            .beads
+            .iter()
+            .flatten()
+            .filter(|n| n.is_confirmed(config));
+        surely.map(|n| {
             let (x, y) = n.beside(ours).position();
             (x, y, n.amplitude)
         })

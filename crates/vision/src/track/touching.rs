@@ -1,9 +1,7 @@
 //! Beads whose images overlap: what one template fits badly is fitted as several beads, and a flow carries them alike.
 
-use super::carried::stood;
-use super::neighbours::{Candidate, MAX_BEADS};
+use super::neighbours::{Candidate, MAX_BEADS, is_sight};
 use super::{Chosen, Tracker};
-use crate::fix::FixQuality;
 use crate::frame::Frame;
 use crate::joint::MOST_TOGETHER;
 use crate::localiser::{Start, Together};
@@ -28,12 +26,18 @@ impl Tracker {
             count += 1;
         }
         let seen = &seen[..count];
+        let radius_px = self.localiser.template().radius_px();
+        // What is no bead is fitted with none: their fit would not be good.
+        let mut alone = [false; MAX_BEADS];
+        for (flag, place) in alone.iter_mut().zip(seen) {
+            *flag = self.beside.is_no_bead(*place, radius_px);
+        }
         let mut done = [false; MAX_BEADS];
         for k in 0..count {
             if done[k] {
                 continue;
             }
-            let members = self.group(seen, k);
+            let members = self.group(seen, &alone, k);
             let size = members.iter().filter(|m| **m).count();
             if (2..=MOST_TOGETHER).contains(&size) && self.locate_group(frame, seen, &members) {
                 for (flag, member) in done.iter_mut().zip(members) {
@@ -51,17 +55,18 @@ impl Tracker {
         }
     }
 
-    /// Those of the places that are near to the place `k`, or to one that is.
-    fn group(&self, seen: &[(f64, f64)], k: usize) -> [bool; MAX_BEADS] {
+    /// Those of the places that are near to the place `k`, or to one that is; of those that stand alone none.
+    fn group(&self, seen: &[(f64, f64)], alone: &[bool; MAX_BEADS], k: usize) -> [bool; MAX_BEADS] {
         let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
         let mut members = [false; MAX_BEADS];
         members[k] = true;
         // A chain of places grows by at least one in each round, or is whole.
-        let mut grows = true;
+        let mut grows = !alone[k];
         while grows {
             grows = false;
             for i in 0..seen.len() {
                 let joins = !members[i]
+                    && !alone[i]
                     && (0..seen.len()).any(|o| {
                         members[o]
                             && f64::hypot(seen[i].0 - seen[o].0, seen[i].1 - seen[o].1) < reach_px
@@ -91,8 +96,8 @@ impl Tracker {
         let mut together = self.localiser.locate_together(frame, starts);
         if !together.is_some_and(|t| t.all_seen()) {
             // A step of the flow that has carried the chosen bead to one of them draws every image out.
-            let (stood_px, radius_px) = (self.stood_px, self.localiser.template().radius_px());
-            let came = |to: &&Start| !stood(&stood_px, to.place_px, radius_px);
+            let (beside, radius_px) = (self.beside, self.localiser.template().radius_px());
+            let came = |to: &&Start| !beside.stood(to.place_px, radius_px);
             let carried = |from| {
                 starts
                     .iter()
@@ -155,8 +160,8 @@ impl Tracker {
         }
         let away_px = |c: &Candidate| f64::hypot(c.seen_px.0 - x, c.seen_px.1 - y);
         let reach_px = TOUCHING_RADII * radius_px;
-        let is_good = |c: &&Candidate| c.fix.verdict == FixQuality::Good && away_px(c) < reach_px;
-        if self.candidates.iter().flatten().filter(is_good).count() >= n {
+        let is_seen = |c: &&Candidate| is_sight(&c.fix) && away_px(c) < reach_px;
+        if self.candidates.iter().flatten().filter(is_seen).count() >= n {
             return;
         }
         let mut best = self.localiser.locate_together(frame, starts);
@@ -204,7 +209,7 @@ impl Tracker {
         let own_px = chosen.motion.position();
         let share = self.config.max_amplitude_change / 3.0;
         let contrast = |amplitude: f64| Some((amplitude, share * amplitude.abs()));
-        let neighbours = self.neighbours.predictions(&chosen.motion);
+        let neighbours = self.neighbours.confirmed(&chosen.motion, &self.config);
         let near = neighbours.filter(|(x, y, _)| f64::hypot(x - own_px.0, y - own_px.1) < reach_px);
         let own = (own_px.0, own_px.1, chosen.identity.amplitude());
         let (mut starts, mut n): (Starts, _) = (Default::default(), 0);
