@@ -42,7 +42,9 @@ impl Tracker {
                 let mut known = self.neighbours.confirmed(&chosen.motion, &self.config);
                 known.any(|(x, y, _)| is_near(c.seen_px, (x, y)))
             });
-            *slot = Some((c.seen_px, followed || is_sight(&c.fix)));
+            let fit_px = (c.fix.x_px, c.fix.y_px);
+            let is_bead = is_sight(&c.fix) && is_near(c.seen_px, fit_px);
+            *slot = Some((c.seen_px, followed || is_bead));
         }
         self.beside = beside;
     }

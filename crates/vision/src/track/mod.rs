@@ -184,7 +184,7 @@ impl Tracker {
     }
 
     fn search(&mut self, frame: &Frame, time_s: f64) -> (Decision, Option<Fix>) {
-        self.look_around(frame);
+        self.look_around(frame, false);
         let aim = self.aim;
         let distance = |c: &Candidate| match aim {
             Some((x, y)) => f64::hypot(c.fix.x_px - x, c.fix.y_px - y),
@@ -220,7 +220,7 @@ impl Tracker {
         mut chosen: Chosen,
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
-        self.look_around(frame);
+        self.look_around(frame, false);
         let (mut fix, mut size) = (Fix::none(0.0, 0.0, FixQuality::NoSignal), None);
         let away = |c: &&Candidate| chosen.motion.distance2(&c.fix);
         let seen = self.candidates.iter().flatten();
@@ -279,21 +279,17 @@ impl Tracker {
         chosen: Chosen,
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
-        self.look_around(frame);
-        let (x, y) = chosen.motion.position();
-        let radius_px = self.localiser.template().radius_px();
-        let is_there = |c: &Candidate| {
-            c.fix.verdict == FixQuality::Good
-                && f64::hypot(c.fix.x_px - x, c.fix.y_px - y) < radius_px
-        };
-        if !self.candidates.iter().flatten().any(is_there) {
-            // The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.
-            let fix = self.localiser.locate(frame, Some((x, y)));
-            let size = self.localiser.relative_size(&fix);
-            self.add_candidate(Candidate::new(fix, size));
+        let all_seen = self.look_around(frame, false);
+        // One that is where it was predicted was carried nowhere, unless another one may have come there.
+        let quiet = self.neighbours.count() == 0 && self.is_predicted(&chosen);
+        if !quiet {
+            if !all_seen {
+                self.look_around(frame, true);
+            }
+            self.look_at_prediction(frame, &chosen);
+            self.fit_as_carried(frame, &chosen);
+            self.part_touching_beads(frame, &chosen);
         }
-        self.fit_as_carried(frame, &chosen);
-        self.part_touching_beads(frame, &chosen);
 
         let alone = self.is_alone();
         let (mut best, mut nearest) = (None::<usize>, None::<Fix>);
@@ -371,6 +367,30 @@ impl Tracker {
             }
             (None, Some(_)) => (Decision::Ambiguous, nearest),
             (None, None) => (misfit.unwrap_or(Decision::NothingFound), nearest),
+        }
+    }
+
+    /// Whether a candidate is the bead as it was predicted.
+    fn is_predicted(&self, chosen: &Chosen) -> bool {
+        self.candidates.iter().flatten().any(|c| {
+            c.fix.verdict == FixQuality::Good
+                && self.within_gate(&chosen.motion, &c.fix)
+                && chosen.identity.agrees(&self.config, &c.fix, c.size)
+        })
+    }
+
+    /// The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.
+    fn look_at_prediction(&mut self, frame: &Frame, chosen: &Chosen) {
+        let (x, y) = chosen.motion.position();
+        let radius_px = self.localiser.template().radius_px();
+        let is_there = |c: &Candidate| {
+            c.fix.verdict == FixQuality::Good
+                && f64::hypot(c.fix.x_px - x, c.fix.y_px - y) < radius_px
+        };
+        if !self.candidates.iter().flatten().any(is_there) {
+            let fix = self.localiser.locate(frame, Some((x, y)));
+            let size = self.localiser.relative_size(&fix);
+            self.add_candidate(Candidate::new(fix, size));
         }
     }
 

@@ -16,8 +16,9 @@ const STREAK_PX: f64 = 0.5;
 type Starts = [Start; MOST_TOGETHER];
 
 impl Tracker {
-    /// Locates every bead that the detector sees, those near each other together.
-    pub(super) fn look_around(&mut self, frame: &Frame) {
+    /// Locates every bead that the detector sees, those near each other together; with `carried` also as a step of the flow draws
+    /// them out that has carried the chosen bead to one of them. Whether all that are near each other were beads.
+    pub(super) fn look_around(&mut self, frame: &Frame, carried: bool) -> bool {
         self.candidates = [None; MAX_BEADS];
         self.detector.detect(frame);
         let (mut seen, mut count) = ([(0.0, 0.0); MAX_BEADS], 0);
@@ -32,18 +33,23 @@ impl Tracker {
         for (flag, place) in alone.iter_mut().zip(seen) {
             *flag = self.beside.is_no_bead(*place, radius_px);
         }
-        let mut done = [false; MAX_BEADS];
+        let (mut done, mut all_seen) = ([false; MAX_BEADS], true);
         for k in 0..count {
             if done[k] {
                 continue;
             }
             let members = self.group(seen, &alone, k);
             let size = members.iter().filter(|m| **m).count();
-            if (2..=MOST_TOGETHER).contains(&size) && self.locate_group(frame, seen, &members) {
-                for (flag, member) in done.iter_mut().zip(members) {
-                    *flag |= member;
+            if (2..=MOST_TOGETHER).contains(&size) {
+                // Seen or not: from another of them it would be the same fit.
+                let first = members.iter().position(|m| *m) == Some(k);
+                if first && self.locate_group(frame, seen, &members, carried) {
+                    for (flag, member) in done.iter_mut().zip(members) {
+                        *flag |= member;
+                    }
+                    continue;
                 }
-                continue;
+                all_seen = false;
             }
             let fix = self.localiser.locate(frame, Some(seen[k]));
             let relative_size = self.localiser.relative_size(&fix);
@@ -53,6 +59,7 @@ impl Tracker {
                 seen_px: seen[k],
             });
         }
+        all_seen
     }
 
     /// Those of the places that are near to the place `k`, or to one that is; of those that stand alone none.
@@ -84,6 +91,7 @@ impl Tracker {
         frame: &Frame,
         seen: &[(f64, f64)],
         members: &[bool; MAX_BEADS],
+        carried: bool,
     ) -> bool {
         let (mut starts, mut n): (Starts, _) = (Default::default(), 0);
         for (place, _) in seen.iter().zip(members).filter(|(_, member)| **member) {
@@ -94,17 +102,17 @@ impl Tracker {
         }
         let starts = &starts[..n];
         let mut together = self.localiser.locate_together(frame, starts);
-        if !together.is_some_and(|t| t.all_seen()) {
+        if carried && !together.is_some_and(|t| t.all_seen()) {
             // A step of the flow that has carried the chosen bead to one of them draws every image out.
             let (beside, radius_px) = (self.beside, self.localiser.template().radius_px());
             let came = |to: &&Start| !beside.stood(to.place_px, radius_px);
-            let carried = |from| {
+            let ways = |from| {
                 starts
                     .iter()
                     .filter(came)
                     .map(move |to| way(from, to.place_px))
             };
-            for way_px in self.chosen.into_iter().flat_map(carried) {
+            for way_px in self.chosen.into_iter().flat_map(ways) {
                 let fitted = self.locate_carried(frame, starts, way_px);
                 together = fitted.filter(Together::all_seen).or(together);
             }
