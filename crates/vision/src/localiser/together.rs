@@ -115,10 +115,11 @@ impl Localiser {
     }
 
     /// Gauss-Newton passes until no bead moves; whether they have come to rest.
-    fn fit_together(&self, beads: &mut [Bead]) -> Option<(bool, Rest)> {
+    fn fit_together(&mut self, beads: &mut [Bead]) -> Option<(bool, Rest)> {
         let reach_px = 0.4 * self.template.radius_px();
         let (mut rest, mut before): (Option<Rest>, Option<Places>) = (None, None);
         for n in 1..=self.config.max_passes {
+            self.count_pass(beads.len());
             let weights = self.weights_of(rest.map(|r| (1.0, r.background)));
             let unit = self.weight_unit();
             let found = joint::pass(

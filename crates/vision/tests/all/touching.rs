@@ -191,3 +191,50 @@ fn a_flow_that_steps_carries_two_touching_beads_alike() {
 fn flows_that_step_part_no_bead_from_its_identity_in_many_runs() {
     table(20);
 }
+
+/// Dust and a wall stay where they are and are no beads. Each search fits them again, but not as images that a flow draws out.
+#[test]
+fn what_stands_beside_a_bead_takes_little_of_a_frames_time() {
+    let (template, mut random) = (template(), Random(17));
+    let spot = ProfileSpec::Gaussian { sigma_px: 1.2 };
+    let dust = spot.template(PixelResponse::Point).expect("a template");
+    // A bead in the middle needs two passes over its window, and searches look at eight objects.
+    let window_px = LocaliserConfig::new(ProfileSpec::Ring { edge_px: EDGE_PX }).window_px as u64;
+    let of_one = 2 * window_px * window_px;
+    println!(
+        "dust at px from the bead | frames of more than 100 fixes | fixes a frame in the mean"
+    );
+    for (x_px, y_px) in [(15.0, 14.0), (30.0, 10.0), (50.0, -20.0)] {
+        let mut tracker = Tracker::new(localiser(), TrackerConfig::default()).expect("a tracker");
+        let (mut busy, mut before, mut tracked) = (0, 0, 0);
+        for k in 0..FRAMES {
+            // It shakes by a pixel, and steps by as much as a tap on the syringe makes it, four times.
+            let stepped = if k / 150 % 2 == 1 { 6.0 } else { 0.0 };
+            let bead = (50.0 + stepped + random.normal(), 32.0);
+            let pixels = picture(&template, &[bead], [0.0; 2], &mut random);
+            let mut image: Vec<f32> = pixels.iter().map(|p| f32::from(*p)).collect();
+            for (i, j) in [(0.0, 0.0), (3.0, 1.0), (6.0, -1.5), (1.0, 7.0), (9.0, 6.0)] {
+                let at = (50.0 + x_px + i, 32.0 + y_px + j);
+                dust.draw(&mut image, WIDTH, at.0, at.1, 45.0);
+            }
+            let pixels: Vec<u8> = image
+                .iter()
+                .map(|v| v.round().clamp(0.0, 255.0) as u8)
+                .collect();
+            let commanded = Commanded {
+                exposure_s: EXPOSURE_S,
+                ..Commanded::default()
+            };
+            let step = tracker.step(Some(&frame(&pixels)), f64::from(k) * DT_S, commanded);
+            tracked += usize::from(step.state == TrackState::Tracking);
+            let drawn = tracker.localiser().drawn_px();
+            busy += u32::from(drawn - before > 100 * of_one);
+            before = drawn;
+        }
+        let mean = before / u64::from(FRAMES) / of_one;
+        println!("{x_px:4} {y_px:4} | {busy:3} | {mean}, tracked {tracked}");
+        assert!(tracked > FRAMES as usize * 9 / 10, "{tracked}");
+        // A step of the flow may take four frames: the bead is looked for in each object, drawn out.
+        assert!(busy <= 16 && mean <= 20, "{busy} {mean}");
+    }
+}
