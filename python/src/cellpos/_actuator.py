@@ -354,6 +354,8 @@ class ActuatorServer:
         if behind > 0:
             self._skipped += behind
             due_s += behind * self._period_s
+        # A call that came late in its period puts off the next one.
+        due_s = max(due_s, self._called_s + _NEARLY * self._period_s)
         while True:
             now_s = time.monotonic()
             if self.board.commanded:
