@@ -91,27 +91,61 @@ pub enum NothingToSuggest {
 
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
 ///
-/// Where fewer beads than frames stand out, walls and dust may hide them: then what stands still is taken out of the frames, and the
-/// search in which more beads are found counts.
+/// Where fewer beads than frames stand out, walls and dust may hide them; where they stand still, they may be dust. Then what stands
+/// still is taken out of the frames, and the search in which more beads are found counts, or the one whose beads move.
 ///
 /// # Errors
 /// Nothing stands out, or what does is not alike, or not round.
 pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
     let mut flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
     let found = suggest_in(frames, &flats);
-    let taken = |found: &Result<Suggestion, _>| found.as_ref().map_or(0, |found| found.taken);
-    if taken(&found) >= frames.len() || !objects::take_out_what_stands_still(&mut flats) {
-        return found;
+    let count = frames.len();
+    let standing = found.as_ref().is_ok_and(|found| found.stands(count));
+    let taken = |found: &Result<Found, _>| found.as_ref().map_or(0, |found| found.fits.len());
+    let doubtful = standing || taken(&found) < count;
+    if !doubtful || !objects::take_out_what_stands_still(&mut flats) {
+        return found.map(|found| found.suggestion);
     }
-    let moving = suggest_in(frames, &flats);
-    if taken(&moving) > taken(&found) {
-        moving
-    } else {
-        found
+    let others = suggest_in(frames, &flats);
+    let better = match (&found, &others) {
+        (Ok(found), Ok(others)) if standing => {
+            2 * others.fits.len() > count && others.are_elsewhere(found)
+        }
+        _ => taken(&others) > taken(&found),
+    };
+    let found = if better { others } else { found };
+    found.map(|found| found.suggestion)
+}
+
+/// A suggestion and the fixes behind it, with their frames.
+struct Found {
+    suggestion: Suggestion,
+    fits: Vec<(usize, Fix)>,
+}
+
+impl Found {
+    /// Whether more than half of the fixes have one near in at least half of the frames: dust, or beads that rest.
+    fn stands(&self, frames: usize) -> bool {
+        let stands = |own: &&(usize, Fix)| 2 * self.near(&own.1).count() >= frames;
+        2 * self.fits.iter().filter(stands).count() > self.fits.len()
+    }
+
+    /// Whether more than half of the fixes are near none of another search.
+    fn are_elsewhere(&self, other: &Found) -> bool {
+        let apart = |own: &&(usize, Fix)| other.near(&own.1).next().is_none();
+        2 * self.fits.iter().filter(apart).count() > self.fits.len()
+    }
+
+    /// The fixes in whose windows another one lies.
+    fn near(&self, of: &Fix) -> impl Iterator<Item = &(usize, Fix)> {
+        let within_px = 0.5 * self.suggestion.config.window_px as f64;
+        let near = move |f: &Fix| f64::hypot(f.x_px - of.x_px, f.y_px - of.y_px) < within_px;
+        let of_all = self.fits.iter();
+        of_all.filter(move |(_, f)| near(f))
     }
 }
 
-fn suggest_in(frames: &[Frame], flats: &[Flat]) -> Result<Suggestion, NothingToSuggest> {
+fn suggest_in(frames: &[Frame], flats: &[Flat]) -> Result<Found, NothingToSuggest> {
     let mut refused = Refused::default();
     let mut objects = Vec::new();
     for (n, flat) in flats.iter().enumerate() {
@@ -135,11 +169,9 @@ fn suggest_in(frames: &[Frame], flats: &[Flat]) -> Result<Suggestion, NothingToS
         objects.retain(|o| !alike.contains(o));
         refused.other = total - alike.len();
         match learn(frames, flats, (alike, &all), refused) {
-            Ok(suggestion) => {
-                return Ok(Suggestion {
-                    objects: seen,
-                    ..suggestion
-                });
+            Ok(mut found) => {
+                found.suggestion.objects = seen;
+                return Ok(found);
             }
             Err(error) => failed = failed.or(Some(error)),
         }
@@ -185,10 +217,10 @@ pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, Nothing
         other: seen - alike.len(),
         ..Refused::default()
     };
-    let suggestion = learn(frames, &flats, (alike, &all), refused)?;
+    let found = learn(frames, &flats, (alike, &all), refused)?;
     Ok(Suggestion {
         objects: seen,
-        ..suggestion
+        ..found.suggestion
     })
 }
 
@@ -197,7 +229,7 @@ fn learn(
     flats: &[Flat],
     (alike, all): (Vec<Object>, &[Object]),
     mut refused: Refused,
-) -> Result<Suggestion, NothingToSuggest> {
+) -> Result<Found, NothingToSuggest> {
     let region_px = median(alike.iter().map(|o| o.radius_px));
     let least_px = REACH.0 * region_px;
     let mut reach_px = least_px;
@@ -247,7 +279,7 @@ fn learn(
     config.min_snr = (ROOM_FOR_NOISE * snr).clamp(1.0, 20.0);
     let max_step_px = step_px(&fits, reach_px);
     let range = Range::of(&config, snr);
-    Ok(Suggestion {
+    let suggestion = Suggestion {
         range,
         config,
         max_step_px,
@@ -255,7 +287,8 @@ fn learn(
         taken: fits.len(),
         refused,
         snr,
-    })
+    };
+    Ok(Found { suggestion, fits })
 }
 
 /// Fits the beads, each with the others of its frame; takes over their places and contrasts. The good fixes, with their frames.

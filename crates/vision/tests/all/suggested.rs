@@ -1,9 +1,10 @@
 //! Settings that are found in a recording, and what the loop's tracker makes of the recording with them.
 
+use crate::common::Random;
 use crate::common::stack::Stack;
 use cellpos_vision::{
     Decision, Detector, FixQuality, Frame, LinkConfig, Localiser, LocaliserConfig, ManyTracker,
-    Pixels, ProfileSpec, RingProfile, Suggestion, Tracker, TrackerConfig,
+    PixelResponse, Pixels, Polarity, ProfileSpec, RingProfile, Suggestion, Tracker, TrackerConfig,
     suggest::{refine, suggest},
 };
 use std::path::Path;
@@ -55,6 +56,41 @@ fn suggestion(stack: &Stack) -> Suggestion {
         found.config.profile,
     );
     found
+}
+
+/// Pictures of spots: each with its place, its contrast, and by how much it goes from frame to frame, px.
+fn spots(spots: &[(f64, f64, f64, f64)]) -> Stack {
+    let (width, height, mut random) = (128, 48, Random(71));
+    let spot = ProfileSpec::Gaussian { sigma_px: 1.3 };
+    let template = spot.template(PixelResponse::Point).expect("a template");
+    let mut places: Vec<_> = spots.iter().map(|spot| (spot.0, spot.1)).collect();
+    let page = |_| {
+        let mut image = vec![100.0_f32; width * height];
+        for ((x, y), (_, _, contrast, goes_px)) in places.iter_mut().zip(spots) {
+            template.draw(&mut image, width, *x, *y, *contrast);
+            *x = (*x + goes_px * random.normal()).clamp(10.0, 118.0);
+            *y = (*y + goes_px * random.normal()).clamp(10.0, 38.0);
+        }
+        let mut noisy = |v: &f32| (f64::from(*v) + 1.8 * random.normal()).round() as u8;
+        image.iter().map(&mut noisy).collect()
+    };
+    Stack {
+        width,
+        height,
+        pages: (0..20).map(page).collect(),
+    }
+}
+
+#[test]
+fn a_bead_that_moves_is_found_beside_more_specks_of_dust_and_one_that_rests_without() {
+    let [first, second] = [(30.0, 12.0, -30.0, 0.0), (90.0, 14.0, -27.0, 0.0)];
+    for (contrast, goes_px) in [(25.0, 3.0), (25.0, 6.0)] {
+        let found = suggestion(&spots(&[first, second, (60.0, 24.0, contrast, goes_px)]));
+        assert_eq!(found.config.polarity, Polarity::Bright, "{found:?}");
+        let rests = suggestion(&spots(&[(60.0, 24.0, contrast, 0.1)]));
+        assert_eq!(rests.taken, 20, "{rests:?}");
+        assert_eq!(rests.config.polarity, Polarity::Bright, "{rests:?}");
+    }
 }
 
 #[test]
