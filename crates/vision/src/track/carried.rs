@@ -1,6 +1,7 @@
-//! Beads that a flow carries while the frame is exposed.
+//! Beads that a flow carries while the frame is exposed, and what it does not carry.
 
-use super::neighbours::{Candidate, MAX_BEADS};
+use super::beside::Beside;
+use super::neighbours::{Candidate, MAX_BEADS, is_sight};
 use super::{Chosen, Tracker};
 use crate::fix::FixQuality;
 use crate::frame::Frame;
@@ -58,5 +59,22 @@ impl Tracker {
             }
             self.add_candidate(c);
         }
+    }
+
+    /// Remembers what is seen besides the chosen bead, which is `ours`. A bead that touches another may be refused for once: what
+    /// is followed as a neighbour stays a bead.
+    pub(super) fn remember_beside(&mut self, ours: &Candidate) {
+        let radius_px = self.localiser.template().radius_px();
+        let is_near = |(x, y): (f64, f64), (u, v): (f64, f64)| f64::hypot(x - u, y - v) < radius_px;
+        let is_other = |c: &&Candidate| !is_near(c.seen_px, (ours.fix.x_px, ours.fix.y_px));
+        let is_bead = |c: &Candidate| {
+            let followed = self.chosen.is_some_and(|chosen| {
+                let mut known = self.neighbours.confirmed(&chosen.motion, &self.config);
+                known.any(|(x, y, _)| is_near(c.seen_px, (x, y)))
+            });
+            followed || is_sight(&c.fix) && is_near(c.seen_px, (c.fix.x_px, c.fix.y_px))
+        };
+        let others = self.candidates.iter().flatten().filter(is_other);
+        self.beside = Beside::new(others.map(|c| (c.seen_px, is_bead(c))));
     }
 }
