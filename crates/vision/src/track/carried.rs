@@ -7,7 +7,7 @@ use crate::fix::FixQuality;
 use crate::frame::Frame;
 
 /// A way during an exposure below which an image is not drawn out enough to matter, px: it widens by a twelfth of its square.
-const STREAK_PX: f64 = 0.5;
+pub(super) const STREAK_PX: f64 = 0.5;
 
 impl Tracker {
     /// Fits again what is unlike the bead: a step of the flow that carried it there draws its image out, too.

@@ -1,5 +1,6 @@
 //! Beads whose images overlap: what one template fits badly is fitted as several beads, and a flow carries them alike.
 
+use super::carried::STREAK_PX;
 use super::neighbours::{Candidate, MAX_BEADS, is_sight};
 use super::{Chosen, Tracker};
 use crate::frame::Frame;
@@ -9,8 +10,6 @@ use crate::localiser::{Start, Together};
 /// Beads nearer than this many radii are fitted together: the corner of a window is 2.6 radii from its middle, and a ring's image
 /// ends at 2.4.
 const TOUCHING_RADII: f64 = 5.0;
-/// A way during an exposure below which an image is not drawn out enough to matter, px: it widens by a twelfth of its square.
-const STREAK_PX: f64 = 0.5;
 
 /// Where beads are looked for together.
 type Starts = [Start; MOST_TOGETHER];
