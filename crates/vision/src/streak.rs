@@ -80,6 +80,11 @@ impl Comb {
         self.teeth == 1
     }
 
+    /// Number of teeth: images that are drawn for one bead.
+    pub(crate) fn teeth(&self) -> usize {
+        self.teeth
+    }
+
     /// Share of each tooth in the image.
     pub(crate) fn share(&self) -> f32 {
         1.0 / self.teeth as f32

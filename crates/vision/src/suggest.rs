@@ -91,8 +91,8 @@ pub enum NothingToSuggest {
 
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
 ///
-/// Where fewer beads than frames stand out, walls and dust may hide them; where they stand still, they may be dust. Then what stands
-/// still is taken out of the frames, and the search in which more beads are found counts, or the one whose beads move.
+/// If fewer beads than frames stand out, walls and dust may hide them. If the beads stand still, they may be dust. In both cases the
+/// median of the frames is subtracted, and a second search made. It counts if it finds more beads, or beads that move.
 ///
 /// # Errors
 /// Nothing stands out, or what does is not alike, or not round.
@@ -126,22 +126,23 @@ struct Found {
 impl Found {
     /// Whether more than half of the fixes have one near in at least half of the frames: dust, or beads that rest.
     fn stands(&self, frames: usize) -> bool {
-        let stands = |own: &&(usize, Fix)| 2 * self.near(&own.1).count() >= frames;
+        let stands = |own: &&(usize, Fix)| 2 * self.near(&own.1) >= frames;
         2 * self.fits.iter().filter(stands).count() > self.fits.len()
     }
 
     /// Whether more than half of the fixes are near none of another search.
     fn are_elsewhere(&self, other: &Found) -> bool {
-        let apart = |own: &&(usize, Fix)| other.near(&own.1).next().is_none();
+        let apart = |own: &&(usize, Fix)| other.near(&own.1) == 0;
         2 * self.fits.iter().filter(apart).count() > self.fits.len()
     }
 
-    /// The fixes in whose windows another one lies.
-    fn near(&self, of: &Fix) -> impl Iterator<Item = &(usize, Fix)> {
+    /// Number of fixes within half a window of a place.
+    fn near(&self, place: &Fix) -> usize {
         let within_px = 0.5 * self.suggestion.config.window_px as f64;
-        let near = move |f: &Fix| f64::hypot(f.x_px - of.x_px, f.y_px - of.y_px) < within_px;
-        let of_all = self.fits.iter();
-        of_all.filter(move |(_, f)| near(f))
+        let near = |(_, f): &&(usize, Fix)| {
+            f64::hypot(f.x_px - place.x_px, f.y_px - place.y_px) < within_px
+        };
+        self.fits.iter().filter(near).count()
     }
 }
 

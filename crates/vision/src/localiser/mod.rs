@@ -171,10 +171,10 @@ impl Localiser {
         self.drawn_px
     }
 
-    /// Counts a pass over the window for so many beads.
+    /// Counts a pass over the window with a number of beads in it.
     fn count_pass(&mut self, beads: usize) {
         let pixels = self.crop.width * self.crop.height;
-        self.drawn_px += (pixels * beads * self.comb.offsets().count()) as u64;
+        self.drawn_px += (pixels * beads * self.comb.teeth()) as u64;
     }
 
     /// 1 for bright cores, -1 for dark ones.

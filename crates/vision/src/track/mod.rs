@@ -227,11 +227,7 @@ impl Tracker {
         if let Some(c) = seen.min_by(|a, b| away(a).total_cmp(&away(b))) {
             (fix, size) = (c.fix, c.size);
         }
-        let near = self.within_gate(&chosen.motion, &fix);
-        if fix.verdict == FixQuality::Good
-            && near
-            && chosen.identity.agrees(&self.config, &fix, size)
-        {
+        if self.is_predicted(&chosen, &Candidate::new(fix, size)) {
             chosen.motion.update(&fix);
             chosen.identity.update(&fix, size);
             chosen.confirmed += 1;
@@ -263,9 +259,9 @@ impl Tracker {
             } else {
                 None
             };
-            let good = fix.verdict == FixQuality::Good && self.within_gate(&chosen.motion, &fix);
-            if good && chosen.identity.agrees(&self.config, &fix, size) {
-                self.take(chosen, &Candidate::new(fix, size), time_s);
+            let candidate = Candidate::new(fix, size);
+            if self.is_predicted(&chosen, &candidate) {
+                self.take(chosen, &candidate, time_s);
                 return (Decision::Accepted, Some(fix));
             }
         }
@@ -281,7 +277,8 @@ impl Tracker {
     ) -> (Decision, Option<Fix>) {
         let all_seen = self.look_around(frame, false);
         // One that is where it was predicted was carried nowhere, unless another one may have come there.
-        let quiet = self.neighbours.count() == 0 && self.is_predicted(&chosen);
+        let mut seen = self.candidates.iter().flatten();
+        let quiet = self.neighbours.count() == 0 && seen.any(|c| self.is_predicted(&chosen, c));
         if !quiet {
             if !all_seen {
                 self.look_around(frame, true);
@@ -370,13 +367,11 @@ impl Tracker {
         }
     }
 
-    /// Whether a candidate is the bead as it was predicted.
-    fn is_predicted(&self, chosen: &Chosen) -> bool {
-        self.candidates.iter().flatten().any(|c| {
-            c.fix.verdict == FixQuality::Good
-                && self.within_gate(&chosen.motion, &c.fix)
-                && chosen.identity.agrees(&self.config, &c.fix, c.size)
-        })
+    /// Whether a candidate is the bead, where it was predicted and with the look that it had.
+    fn is_predicted(&self, chosen: &Chosen, c: &Candidate) -> bool {
+        c.fix.verdict == FixQuality::Good
+            && self.within_gate(&chosen.motion, &c.fix)
+            && chosen.identity.agrees(&self.config, &c.fix, c.size)
     }
 
     /// The detector misses a bead that touches a stronger one; the fit at the prediction may still see it.

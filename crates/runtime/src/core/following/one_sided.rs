@@ -50,7 +50,8 @@ impl Side {
     }
 }
 
-/// How much likelier it is that the bead went `bead_um` by itself than that it followed by `follows_um`, natural logarithm of the odds.
+/// Odds that the bead, which went `bead_um`, was not moved by the command, against a motion of `follows_um` by the command: their
+/// natural logarithm.
 fn odds_of_none(bead_um: f64, follows_um: f64, spread_um2: f64) -> f64 {
     follows_um * (0.5 * follows_um - bead_um) / spread_um2
 }
