@@ -2,11 +2,12 @@
 
 use crate::blobs::Blobs;
 use crate::config::MAX_WINDOW_PX;
-use crate::fix::squared;
+use crate::fix::{Fix, squared};
 use crate::frame::{Frame, Pixels};
 use crate::seed;
 use crate::speckle;
 use crate::symmetry::RadialSymmetry;
+use crate::template::{Template, span};
 
 /// Contrast of an object over the noise of a mean of 5 x 5 pixels.
 const LEAST_SIGMA: f32 = 6.0;
@@ -81,8 +82,8 @@ impl Bead {
     ) -> Option<impl Iterator<Item = OfBead> + 'a> {
         let flat = flats.get(self.at.frame)?;
         let (x_px, y_px) = (self.at.x_px, self.at.y_px);
-        let (x0, x1) = crate::template::span(x_px, reach_px, flat.width);
-        let (y0, y1) = crate::template::span(y_px, reach_px, flat.height);
+        let (x0, x1) = span(x_px, reach_px, flat.width);
+        let (y0, y1) = span(y_px, reach_px, flat.height);
         let all = (y0..y1).flat_map(move |y| (x0..x1).map(move |x| (x, y)));
         Some(all.filter_map(move |(x, y)| {
             let (u, v) = (x as f64, y as f64);
@@ -99,32 +100,52 @@ impl Bead {
     }
 }
 
-/// Fewest frames whose median shows the scene without its beads.
+/// Fewest frames whose median shows the scene.
 const FEWEST_FRAMES: usize = 9;
 
-/// Subtracts the median of all frames, pixel by pixel: walls, dust, and beads that rest. False if there are too few frames, or their sizes
-/// differ; then nothing was changed.
-pub(crate) fn take_out_what_stands_still(flats: &mut [Flat]) -> bool {
-    let size = flats.first().map(|flat| (flat.width, flat.height));
-    let alike = |flat: &Flat| Some((flat.width, flat.height)) == size;
+/// What stands still in the frames: the median of each pixel. `None` if there are too few, their sizes differ, or nothing stands: the
+/// halves of the frames predict each other no better than nothing does (mean absolute difference, which a median makes least).
+pub(crate) fn scene(flats: &[Flat]) -> Option<Vec<f32>> {
+    let first = flats.first()?;
+    let alike = |flat: &Flat| (flat.width, flat.height) == (first.width, first.height);
     if flats.len() < FEWEST_FRAMES || !flats.iter().all(alike) {
-        return false;
+        return None;
     }
-    let pixels = flats.iter().map(|flat| flat.values.len()).min();
     let mut greys = Vec::with_capacity(flats.len());
-    for pixel in 0..pixels.unwrap_or(0) {
+    let mut median = |of: &[f32]| {
         greys.clear();
-        greys.extend(flats.iter().map(|flat| flat.values[pixel]));
+        greys.extend_from_slice(of);
         let middle = greys.len() / 2;
-        let (_, &mut still, _) = greys.select_nth_unstable_by(middle, f32::total_cmp);
-        flats
-            .iter_mut()
-            .for_each(|flat| flat.values[pixel] -= still);
-    }
-    true
+        *greys.select_nth_unstable_by(middle, f32::total_cmp).1
+    };
+    let mut gain = 0.0;
+    let mut values = Vec::with_capacity(flats.len());
+    let scene = (0..first.values.len()).map(|pixel| {
+        values.clear();
+        values.extend(flats.iter().step_by(2).map(|flat| flat.values[pixel]));
+        let even = values.len();
+        values.extend(
+            flats
+                .iter()
+                .skip(1)
+                .step_by(2)
+                .map(|flat| flat.values[pixel]),
+        );
+        let (evens, odds) = values.split_at(even);
+        for (by, of) in [(median(evens), odds), (median(odds), evens)] {
+            gain += of
+                .iter()
+                .map(|v| f64::from(v.abs() - (v - by).abs()))
+                .sum::<f64>();
+        }
+        median(&values)
+    });
+    let scene = scene.collect();
+    (gain > 0.0).then_some(scene)
 }
 
 /// A frame as grey levels above its smooth background.
+#[derive(Clone)]
 pub(crate) struct Flat {
     pub width: usize,
     pub height: usize,
@@ -195,6 +216,22 @@ impl Flat {
             .collect();
         for (v, p) in self.values.iter_mut().zip(plane) {
             *v -= p;
+        }
+    }
+
+    /// Subtracts a picture of the same size.
+    pub(crate) fn subtract(&mut self, other: &[f32]) {
+        self.values.iter_mut().zip(other).for_each(|(v, o)| *v -= o);
+    }
+
+    /// Subtracts the image of a bead.
+    pub(crate) fn take_out(&mut self, template: &Template, fix: &Fix) {
+        let (x0, x1) = span(fix.x_px, template.support_px(), self.width);
+        let (y0, y1) = span(fix.y_px, template.support_px(), self.height);
+        for (x, y) in (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))) {
+            let off_px2 = squared(x as f64 - fix.x_px, y as f64 - fix.y_px);
+            self.values[y * self.width + x] -=
+                fix.amplitude as f32 * template.value_at_squared(off_px2 as f32);
         }
     }
 

@@ -5,16 +5,19 @@
 //! background, and those of the commonest size and contrast are taken as beads. The mean profile about their centres becomes the
 //! template: aligned, fitted, aligned again. Offline; allocates.
 
-use crate::config::{LocaliserConfig, MAX_WINDOW_PX, Polarity};
-use crate::fix::{Fix, FixQuality};
+mod settings;
+
+use self::settings::{FADE, rounded, settings};
+use crate::config::{LocaliserConfig, MAX_WINDOW_PX};
+use crate::fix::{Fix, FixQuality, squared};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
 use crate::objects::{self, Bead, Flat, Object, Refused};
 use crate::overlap;
 use crate::range::Range;
 use crate::reach;
-use crate::smooth::{Learnt, Parametric, Rings};
-use crate::template::{ProfileSpec, TABLE_KNOTS, Template};
+use crate::smooth::Rings;
+use crate::template::Template;
 
 /// Passes of aligning and averaging.
 const PASSES: usize = 4;
@@ -24,10 +27,8 @@ const ALIKE: (f64, f64) = (1.3, 1.7);
 const FEWEST: usize = 5;
 /// Least distance up to which a profile is learnt, in radii of the region that stands out, and that up to which its end is looked for.
 const REACH: (f64, f64) = (1.6, 3.2);
-/// Share of its extreme that a profile has at the bead's radius: that of a Gaussian at twice its standard deviation.
-const AT_RADIUS: f64 = 0.135;
-/// Share of a table in which it goes to zero.
-const FADE: f64 = 4.0 / (TABLE_KNOTS - 1) as f64;
+/// Searches without the scene, at most: each has beads whose profile is nearer to their own.
+const SCENES: usize = 3;
 /// Kinds of objects tried, the commonest first.
 const KINDS: usize = 3;
 /// Margin on the residual that the beads themselves have: that of nine in ten, since dust and neighbours spoil some.
@@ -91,40 +92,74 @@ pub enum NothingToSuggest {
 
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
 ///
-/// If fewer beads than frames stand out, walls and dust may hide them. If the beads stand still, they may be dust. In both cases the
-/// median of the frames is subtracted, and a second search made. It counts if it finds more beads, or beads that move.
-///
 /// # Errors
 /// Nothing stands out, or what does is not alike, or not round.
 pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
-    let mut flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
-    let found = suggest_in(frames, &flats);
+    found_in_scene(frames, |flats| suggest_in(frames, flats))
+}
+
+/// Searches in the frames, and again without their scene: walls, dust, uneven light. A bead that keeps its distance from a wall would
+/// have the wall in its profile, and dust outnumbers beads.
+///
+/// The scene is the median, over the frames, of what the beads do not explain. Each search gives beads that explain more. A search
+/// counts unless it finds fewer beads than the one before.
+fn found_in_scene(
+    frames: &[Frame],
+    search: impl Fn(&[Flat]) -> Result<Found, NothingToSuggest>,
+) -> Result<Suggestion, NothingToSuggest> {
+    let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
+    let without_scene = |beads: Option<&Found>| {
+        let template = beads.and_then(|found| found.suggestion.config.template().ok());
+        let scene = match (beads, template) {
+            (Some(found), Some(template)) => {
+                objects::scene(&without_beads(&flats, &template, &found.fits))?
+            }
+            _ => objects::scene(&flats)?,
+        };
+        let mut flats = flats.clone();
+        flats.iter_mut().for_each(|flat| flat.subtract(&scene));
+        Some(search(&flats))
+    };
+    let mut found = search(&flats);
     let count = frames.len();
     let standing = found.as_ref().is_ok_and(|found| found.stands(count));
-    let taken = |found: &Result<Found, _>| found.as_ref().map_or(0, |found| found.fits.len());
-    let doubtful = standing || taken(&found) < count;
-    if !doubtful || !objects::take_out_what_stands_still(&mut flats) {
-        return found.map(|found| found.suggestion);
-    }
-    let others = suggest_in(frames, &flats);
-    let better = match (&found, &others) {
-        (Ok(found), Ok(others)) if standing => {
-            2 * others.fits.len() > count && others.are_elsewhere(found)
+    // What stands may be dust that outnumbers the beads: it is part of the median of the frames themselves.
+    if standing || found.is_err() {
+        let others = without_scene(None);
+        if let Some(Ok(others)) = others
+            && (2 * others.fits.len() > count || !standing)
+            && found
+                .as_ref()
+                .map_or(true, |found| others.are_elsewhere(found))
+        {
+            found = Ok(others);
         }
-        _ => taken(&others) > taken(&found),
-    };
-    let found = if better { others } else { found };
+    }
+    for _ in 0..SCENES {
+        // Where beads rest, nothing tells their images from what is behind them.
+        let Ok(known) = &found else { break };
+        if known.stands(count) {
+            break;
+        }
+        match without_scene(Some(known)) {
+            Some(Ok(next)) if !next.has_fewer_than(known) => found = Ok(next),
+            _ => break,
+        }
+    }
     found.map(|found| found.suggestion)
 }
 
-/// A suggestion and the fixes behind it, with their frames.
+/// A suggestion and the fixes behind it, with their frames, in their order.
 struct Found {
     suggestion: Suggestion,
     fits: Vec<(usize, Fix)>,
+    /// Of the template.
+    radius_px: f64,
 }
 
 impl Found {
-    /// Whether more than half of the fixes have one near in at least half of the frames: dust, or beads that rest.
+    /// Whether the median of the frames holds what was found: more than half of the fixes cover a place that a fix of every other frame
+    /// covers. It is dust, or beads that rest.
     fn stands(&self, frames: usize) -> bool {
         let stands = |own: &&(usize, Fix)| 2 * self.near(&own.1) >= frames;
         2 * self.fits.iter().filter(stands).count() > self.fits.len()
@@ -136,14 +171,30 @@ impl Found {
         2 * self.fits.iter().filter(apart).count() > self.fits.len()
     }
 
-    /// Number of fixes within half a window of a place.
+    /// Number of fixes within a radius of a place.
     fn near(&self, place: &Fix) -> usize {
-        let within_px = 0.5 * self.suggestion.config.window_px as f64;
-        let near = |(_, f): &&(usize, Fix)| {
-            f64::hypot(f.x_px - place.x_px, f.y_px - place.y_px) < within_px
+        let near = |(_, fix): &&(usize, Fix)| {
+            squared(fix.x_px - place.x_px, fix.y_px - place.y_px) < self.radius_px.powi(2)
         };
         self.fits.iter().filter(near).count()
     }
+
+    /// Whether there are fewer fixes than in another search, by more than chance: their number's root.
+    fn has_fewer_than(&self, other: &Found) -> bool {
+        let count = other.fits.len() as f64;
+        (self.fits.len() as f64) < count - count.sqrt()
+    }
+}
+
+/// The frames without the images of their beads.
+fn without_beads(flats: &[Flat], template: &Template, fits: &[(usize, Fix)]) -> Vec<Flat> {
+    let mut rest = flats.to_vec();
+    for (frame, fix) in fits {
+        if let Some(flat) = rest.get_mut(*frame) {
+            flat.take_out(template, fix);
+        }
+    }
+    rest
 }
 
 fn suggest_in(frames: &[Frame], flats: &[Flat]) -> Result<Found, NothingToSuggest> {
@@ -189,13 +240,12 @@ fn suggest_in(frames: &[Frame], flats: &[Flat]) -> Result<Found, NothingToSugges
 /// # Errors
 /// As [`suggest`].
 pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, NothingToSuggest> {
-    let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
     let mut detector = crate::Detector::thorough(rough, 1000);
     let radius_px = 1.85 * rough.template().radius_px();
-    let mut objects = Vec::new();
+    let mut all = Vec::new();
     for (n, frame) in frames.iter().enumerate() {
         for blob in detector.detect(frame) {
-            objects.push(Object {
+            all.push(Object {
                 frame: n,
                 x_px: blob.x_px,
                 y_px: blob.y_px,
@@ -205,23 +255,23 @@ pub fn refine(frames: &[Frame], rough: &Localiser) -> Result<Suggestion, Nothing
             });
         }
     }
-    let all = objects.clone();
-    objects.retain(|o| !o.cut);
-    if objects.is_empty() {
+    let whole: Vec<Object> = all.iter().filter(|o| !o.cut).copied().collect();
+    if whole.is_empty() {
         return Err(NothingToSuggest::Nothing {
             frames: frames.len(),
         });
     }
-    let seen = objects.len();
-    let alike = commonest(&objects);
+    let alike = commonest(&whole);
     let refused = Refused {
-        other: seen - alike.len(),
+        other: whole.len() - alike.len(),
         ..Refused::default()
     };
-    let found = learn(frames, &flats, (alike, &all), refused)?;
+    let found = found_in_scene(frames, |flats| {
+        learn(frames, flats, (alike.clone(), &all), refused)
+    })?;
     Ok(Suggestion {
-        objects: seen,
-        ..found.suggestion
+        objects: whole.len(),
+        ..found
     })
 }
 
@@ -243,15 +293,19 @@ fn learn(
     let mut config = None;
     let mut template: Option<Template> = None;
     let mut fits: Vec<(usize, Fix)> = Vec::new();
-    let mut filled = 1.0_f64;
+    let (mut filled, mut radius_px) = (1.0_f64, region_px);
     for pass in 0..PASSES {
         let rings = collect(flats, &beads, template.as_ref(), least_px);
         let parametric = rings.parametric().ok_or(failed)?;
         if pass > 0 {
-            let learnt = overlap::learn(flats, &beads, parametric, end_px).ok_or(failed)?;
-            let extreme = learnt.at.iter().fold(0.0, |best: f64, v| best.max(v.abs()));
-            let extent_px = reach::extent_px(|r_px| learnt.value(r_px) / extreme, end_px, snr);
-            reach_px = (extent_px / (1.0 - FADE)).clamp(least_px, end_px);
+            let settings: &LocaliserConfig = config.as_ref().ok_or(failed)?;
+            let known = template.as_ref().ok_or(failed)?;
+            let rest = without_beads(flats, known, &fits);
+            let extent_px = reach::round_extent_px(&rest, known, &fits, end_px);
+            // A fit's window has the profile in it, and the level about it.
+            let window_px = LocaliserConfig::new(settings.profile).window_px;
+            let fitted_px = least_px.max(0.5 * window_px as f64).min(end_px);
+            reach_px = (extent_px / (1.0 - FADE)).clamp(fitted_px, end_px);
         }
         let learnt = overlap::learn(flats, &beads, parametric, reach_px).ok_or(failed)?;
         let mut settings = settings(&learnt, parametric, reach_px, snr).ok_or(failed)?;
@@ -261,6 +315,7 @@ fn learn(
         template = settings.template().ok();
         snr = median(fits.iter().map(|(_, f)| f.snr));
         filled = localiser.filled();
+        radius_px = localiser.template().radius_px();
         if fits.len() * 2 < objects && pass + 1 == PASSES {
             return Err(failed);
         }
@@ -289,7 +344,11 @@ fn learn(
         refused,
         snr,
     };
-    Ok(Found { suggestion, fits })
+    Ok(Found {
+        suggestion,
+        fits,
+        radius_px,
+    })
 }
 
 /// Fits the beads, each with the others of its frame; takes over their places and contrasts. The good fixes, with their frames.
@@ -391,72 +450,6 @@ fn contrast_and_level(
     (contrast.is_finite() && contrast != 0.0 && level.is_finite()).then_some((contrast, level))
 }
 
-/// Settings for a learnt profile.
-fn settings(
-    learnt: &Learnt,
-    parametric: Parametric,
-    reach_px: f64,
-    snr: f64,
-) -> Option<LocaliserConfig> {
-    if !learnt.deviates {
-        let spec = match parametric {
-            Parametric::Gaussian(sigma_px) => ProfileSpec::Gaussian {
-                sigma_px: rounded(sigma_px, 1e3),
-            },
-            Parametric::Ring(edge_px) => ProfileSpec::Ring {
-                edge_px: rounded(edge_px, 1e3),
-            },
-        };
-        let mut config = LocaliserConfig::new(spec);
-        if learnt.value(0.0) < learnt.value(reach_px) {
-            config.polarity = Polarity::Dark;
-        }
-        return Some(config);
-    }
-    let knot_px = reach_px / (TABLE_KNOTS - 1) as f64;
-    let profile: [f64; TABLE_KNOTS] = core::array::from_fn(|k| learnt.value(k as f64 * knot_px));
-    let outer = &profile[TABLE_KNOTS * 5 / 6..];
-    let floor = outer.iter().sum::<f64>() / outer.len() as f64;
-    let extreme = profile.iter().map(|v| v - floor).fold(0.0_f64, |best, v| {
-        if v.abs() > best.abs() { v } else { best }
-    });
-    if extreme == 0.0 {
-        return None;
-    }
-    let mut values = profile.map(|v| (v - floor) / extreme);
-    for (k, v) in values.iter_mut().enumerate() {
-        let fade = ((TABLE_KNOTS - 1 - k) as f64 / 4.0).min(1.0);
-        *v *= fade;
-    }
-    let radius_px = (core_knots(&values) * knot_px).max(1.0);
-    let value = |r_px: f64| values[((r_px / knot_px).round() as usize).min(TABLE_KNOTS - 1)];
-    let extent_px = reach::extent_px(value, reach_px, snr);
-    let spec = ProfileSpec::Table {
-        radius_px: rounded(radius_px, 100.0),
-        knot_px: rounded(knot_px, 1e4),
-        values: values.map(|v| rounded(v, 1e4)),
-    };
-    let mut config = LocaliserConfig::new(spec);
-    let whole = 2 * extent_px.ceil() as usize + 1;
-    config.window_px = whole.clamp(config.window_px, MAX_WINDOW_PX);
-    config.polarity = if extreme > 0.0 {
-        Polarity::Bright
-    } else {
-        Polarity::Dark
-    };
-    Some(config)
-}
-
-/// Distance at which a profile first falls to [`AT_RADIUS`] of its extreme, outwards from there, in knots.
-fn core_knots(values: &[f64; TABLE_KNOTS]) -> f64 {
-    let size = |k: usize| values.get(k).map_or(0.0, |v| v.max(0.0));
-    let extreme = (0..TABLE_KNOTS).max_by(|a, b| size(*a).total_cmp(&size(*b)));
-    let first = (extreme.unwrap_or(0)..TABLE_KNOTS - 1).find(|k| size(k + 1) < AT_RADIUS);
-    first.map_or(TABLE_KNOTS as f64, |k| {
-        k as f64 + (size(k) - AT_RADIUS) / (size(k) - size(k + 1))
-    })
-}
-
 /// Farthest step of a bead between neighbouring frames, with a margin; without such steps, a bead's reach.
 fn step_px(fits: &[(usize, crate::Fix)], reach_px: f64) -> f64 {
     let mut steps = Vec::new();
@@ -471,10 +464,6 @@ fn step_px(fits: &[(usize, crate::Fix)], reach_px: f64) -> f64 {
         return reach_px;
     }
     rounded((2.5 * quantile(steps.into_iter(), 0.99)).max(2.0), 10.0)
-}
-
-fn rounded(v: f64, per_unit: f64) -> f64 {
-    (v * per_unit).round() / per_unit
 }
 
 fn median(values: impl Iterator<Item = f64>) -> f64 {
