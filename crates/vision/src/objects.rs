@@ -103,8 +103,9 @@ impl Bead {
 /// Fewest frames whose median shows the scene.
 const FEWEST_FRAMES: usize = 9;
 
-/// What stands still in the frames: the median of each pixel. `None` if there are too few, their sizes differ, or nothing stands: the
-/// halves of the frames predict each other no better than nothing does (mean absolute difference, which a median makes least).
+/// What stands still in the frames: the median of each pixel where the halves of the frames predict each other better than zero does
+/// (in the mean absolute difference, which a median makes least), and zero elsewhere. `None` if there are too few frames, or their
+/// sizes differ.
 pub(crate) fn scene(flats: &[Flat]) -> Option<Vec<f32>> {
     let first = flats.first()?;
     let alike = |flat: &Flat| (flat.width, flat.height) == (first.width, first.height);
@@ -118,7 +119,6 @@ pub(crate) fn scene(flats: &[Flat]) -> Option<Vec<f32>> {
         let middle = greys.len() / 2;
         *greys.select_nth_unstable_by(middle, f32::total_cmp).1
     };
-    let mut gain = 0.0;
     let mut values = Vec::with_capacity(flats.len());
     let scene = (0..first.values.len()).map(|pixel| {
         values.clear();
@@ -132,16 +132,16 @@ pub(crate) fn scene(flats: &[Flat]) -> Option<Vec<f32>> {
                 .map(|flat| flat.values[pixel]),
         );
         let (evens, odds) = values.split_at(even);
+        let mut gain = 0.0;
         for (by, of) in [(median(evens), odds), (median(odds), evens)] {
             gain += of
                 .iter()
                 .map(|v| f64::from(v.abs() - (v - by).abs()))
                 .sum::<f64>();
         }
-        median(&values)
+        if gain > 0.0 { median(&values) } else { 0.0 }
     });
-    let scene = scene.collect();
-    (gain > 0.0).then_some(scene)
+    Some(scene.collect())
 }
 
 /// A frame as grey levels above its smooth background.
