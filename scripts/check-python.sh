@@ -13,10 +13,10 @@ if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
     exit 0
 fi
 [ "${1:-}" = install ] && exit 0
-# The whole workspace, whose features the tests have built: one package alone has others, and is built anew.
+# The whole workspace, whose features the tests have built: one package alone may have others, and is built anew.
 cargo build -q --locked --workspace --bin firmware-sim
 CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
     "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
 cd python
-# Two at once: most tests wait for rigs in real time.
-env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q -n 2 --dist loadfile "$@"
+# Three at once: most tests wait for rigs in real time.
+env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q -n 3 --dist loadfile "$@"
