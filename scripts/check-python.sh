@@ -2,18 +2,21 @@
 # The Python package: installed into a separate environment as a user would, then its tests, with the snippets of docs/python.md.
 # The program is built with the profile and into the folder that the tests of the workspace use, so that nothing is built twice.
 # Skipped with the reason where the environment cannot be made.
+#   scripts/check-python.sh [WORDS]   all of it; the words are for pytest
+#   scripts/check-python.sh install   the environment only
 set -euo pipefail
 cd "$(dirname "$0")/.."
 env=target/python
 if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
-    || ! "$env/bin/pip" install -q --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest pytest-xdist mypy pypylon imageio pyserial; then
+    || ! "$env/bin/pip" install -q --no-compile --disable-pip-version-check "maturin>=1.7,<2" numpy pandas matplotlib pytest pytest-xdist mypy pypylon imageio pyserial; then
     echo "check-python: skipped: maturin, numpy, pandas, matplotlib, pytest, pytest-xdist, mypy, pypylon, imageio and pyserial cannot be installed here"
     exit 0
 fi
-# The whole workspace, whose features the tests have built: one package alone has others, and is built anew.
+[ "${1:-}" = install ] && exit 0
+# The whole workspace, whose features the tests have built: one package alone may have others, and is built anew.
 cargo build -q --locked --workspace --bin firmware-sim
 CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
     "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
 cd python
-# Two at once: most tests wait for rigs in real time.
-env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q -n 2 --dist loadfile "$@"
+# Three at once: most tests wait for rigs in real time.
+env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q -n 3 --dist loadfile "$@"

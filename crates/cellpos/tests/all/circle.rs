@@ -221,11 +221,11 @@ fn a_sine_of_track_and_a_script_each_show_what_their_rig_hides() {
     let at = folder.path();
     hide(at, "hidden.toml", effects::gain_error(0.8));
     std::fs::write(at.join("rig.toml"), "[emulator]\nmodel = \"hidden.toml\"\n").unwrap();
-    let script = "name = \"tire\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 120\n\
-                  [[step]]\ndo = \"sine\"\namplitude = \"3um\"\nfrequency = \"4Hz\"\ncycles = 24\n\
-                  [[step]]\ndo = \"hold\"\nduration = \"4s\"\n";
+    let script = "name = \"tire\"\n[[step]]\ndo = \"sine\"\namplitude = \"1um\"\nfrequency = \"20Hz\"\ncycles = 80\n\
+                  [[step]]\ndo = \"sine\"\namplitude = \"3um\"\nfrequency = \"4Hz\"\ncycles = 14\n\
+                  [[step]]\ndo = \"hold\"\nduration = \"2s\"\n";
     std::fs::write(at.join("tire.toml"), script).unwrap();
-    let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 10s";
+    let track = "track --target 0um --controller pi --sine 3um@10Hz --duration 6s";
     for (line, seed) in [(track, 4), ("run tire.toml", 5)] {
         let line =
             format!("{line} --rig rig.toml --clock virtual --frames off --seed {seed} --json");

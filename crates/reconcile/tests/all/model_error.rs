@@ -9,7 +9,12 @@ const OFF_S: f64 = 2.5e-4;
 const STATED_S: f64 = 1.5e-4;
 
 /// Reconciles a survey with a model whose delay is too long.
-fn beside_a_long_delay(hidden: Hidden, stated: bool, seed: u64) -> Reconciliation {
+fn beside_a_long_delay(
+    hidden: Hidden,
+    stated: bool,
+    max_effects: usize,
+    seed: u64,
+) -> Reconciliation {
     let flow = Flow {
         wander_um: 0.006,
         time_s: 20.0,
@@ -30,6 +35,7 @@ fn beside_a_long_delay(hidden: Hidden, stated: bool, seed: u64) -> Reconciliatio
     });
     let options = Options {
         free_working_point: true,
+        max_effects,
         ..Options::default()
     };
     let record = closed_loop(flow, hidden, survey, seed);
@@ -42,16 +48,16 @@ fn ids(r: &Reconciliation) -> Vec<&str> {
 
 #[test]
 fn an_error_that_the_model_states_is_no_effect() {
-    let r = beside_a_long_delay(Hidden::Nothing, true, 81);
+    let r = beside_a_long_delay(Hidden::Nothing, true, 4, 81);
     assert_eq!(r.verdict, Verdict::NothingMissing, "{:?}", r.places);
-    // The same error is a disagreement where the model states none.
-    let r = beside_a_long_delay(Hidden::Nothing, false, 81);
+    // The same error is a disagreement where the model states none, whatever would be named after the first.
+    let r = beside_a_long_delay(Hidden::Nothing, false, 1, 81);
     assert_ne!(r.verdict, Verdict::NothingMissing, "{:?}", r.places);
 }
 
 #[test]
 fn an_effect_beside_it_has_its_name_and_an_interval_with_that_error_in_it() {
-    let r = beside_a_long_delay(Hidden::Lag(120.0), true, 82);
+    let r = beside_a_long_delay(Hidden::Lag(120.0), true, 4, 82);
     assert_eq!(ids(&r), ["driver-lag"], "{:?}", r.places);
     let hz = &r.effects[0].parameters["bandwidth_hz"];
     let half = 0.5 * (hz.ci95[1] - hz.ci95[0]);

@@ -15,20 +15,28 @@ fn named(r: &Reconciliation) -> Vec<&str> {
     names
 }
 
+/// A flow of this wandering (um, s) and drift (um/s) leaves the delay as the only name.
+fn moves(wander_um: f64, time_s: f64, drift_um_per_s: f64, seed: u64) {
+    let flow = Flow {
+        wander_um,
+        time_s,
+        drift_um_per_s,
+    };
+    let r = run(closed_loop(flow, Hidden::Nothing, tones, seed));
+    assert_eq!(named(&r), ["time-delay"], "{:?} {:?}", r.places, r.noise);
+    assert_eq!(r.verdict, Verdict::Named, "{:?}", r.remainder);
+    assert!(r.noise.zero_flow.is_some(), "{:?}", r.noise);
+}
+
 #[test]
 fn a_zero_flow_that_moves_is_no_effect_of_the_response() {
-    let flows = [(0.02, 5.0, 0.0), (0.002, 50.0, 0.005)];
-    for (seed, (wander_um, time_s, drift_um_per_s)) in flows.into_iter().enumerate() {
-        let flow = Flow {
-            wander_um,
-            time_s,
-            drift_um_per_s,
-        };
-        let r = run(closed_loop(flow, Hidden::Nothing, tones, 41 + seed as u64));
-        assert_eq!(named(&r), ["time-delay"], "{:?} {:?}", r.places, r.noise);
-        assert_eq!(r.verdict, Verdict::Named, "{:?}", r.remainder);
-        assert!(r.noise.zero_flow.is_some(), "{:?}", r.noise);
-    }
+    moves(0.02, 5.0, 0.0, 41);
+}
+
+#[test]
+#[ignore = "slow: the fast one has a flow that wanders alone; for the nightly run"]
+fn a_zero_flow_that_drifts_is_no_effect_of_the_response() {
+    moves(0.002, 50.0, 0.005, 42);
 }
 
 #[test]

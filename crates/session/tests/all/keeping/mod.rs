@@ -17,6 +17,7 @@ mod table;
 use cellpos_session::rig_file::Frames;
 use held::{Held, Row, hold};
 use rows::{FLIPPED_MS, LAWS, Limits};
+use std::ops::RangeInclusive;
 
 #[test]
 fn steps_of_the_flow_and_stalls_keep_the_bead_under_every_law_and_the_last_word_is_true() {
@@ -96,20 +97,12 @@ fn the_stated_error_counts_the_moments_without_a_fix_as_they_were() {
     }
 }
 
-#[test]
-fn the_uncertainty_of_a_bead_that_is_not_seen_is_its_error_however_long_it_takes() {
-    let seeds = table::seeds(24);
+/// Law, begin of the time without a fix and its length, s.
+type Unseen = (&'static str, f64, f64);
+
+fn the_uncertainty_is_the_error(rows: &[Unseen], seeds: RangeInclusive<u64>) {
     let count = seeds.clone().count() as f64;
-    for (law, at_s, unseen_s) in [
-        ("lqg", 0.12, 0.2),
-        ("pi", 0.3, 0.4),
-        ("lqg", 2.6, 0.005),
-        ("pi", 2.6, 0.02),
-        ("lqg", 2.6, 0.1),
-        ("pi", 2.6, 0.4),
-        ("lqg", 2.6, 1.0),
-        ("lqg", 2.6, 3.0),
-    ] {
+    for &(law, at_s, unseen_s) in rows {
         let squares = seeds
             .clone()
             .map(|seed| silence::squared_error(law, seed, at_s, unseen_s));
@@ -119,6 +112,29 @@ fn the_uncertainty_of_a_bead_that_is_not_seen_is_its_error_however_long_it_takes
         let most = 3.0 * (2.0 / count).sqrt();
         assert!((mean - 1.0).abs() < most, "{law}, {unseen_s} s: {mean}");
     }
+}
+
+#[test]
+fn the_uncertainty_of_a_bead_that_is_not_seen_is_its_error_however_long_it_takes() {
+    let rows = [
+        ("lqg", 0.12, 0.2),
+        ("pi", 0.3, 0.4),
+        ("pi", 2.6, 0.02),
+        ("lqg", 2.6, 1.0),
+    ];
+    the_uncertainty_is_the_error(&rows, table::seeds(24));
+}
+
+#[test]
+#[ignore = "slow: other times without a fix; the fast one has one of each kind"]
+fn the_uncertainty_of_a_bead_is_its_error_at_every_time_without_a_fix() {
+    let rows = [
+        ("lqg", 2.6, 0.005),
+        ("lqg", 2.6, 0.1),
+        ("pi", 2.6, 0.4),
+        ("lqg", 2.6, 3.0),
+    ];
+    the_uncertainty_is_the_error(&rows, 1..=24);
 }
 
 #[test]
