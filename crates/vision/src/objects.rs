@@ -103,9 +103,9 @@ impl Bead {
 /// Fewest frames whose median shows the scene.
 const FEWEST_FRAMES: usize = 9;
 
-/// What stands still in the frames: the median of each pixel where the halves of the frames predict each other better than zero does
-/// (in the mean absolute difference, which a median makes least), and zero elsewhere. `None` if there are too few frames, or their
-/// sizes differ.
+/// The picture that the frames share: the median of each pixel. It counts where the halves of the frames predict each other better
+/// than zero does, and is zero elsewhere. The measure is the mean absolute difference, which a median makes least. `None` if there are
+/// too few frames, or their sizes differ.
 pub(crate) fn scene(flats: &[Flat]) -> Option<Vec<f32>> {
     let first = flats.first()?;
     let alike = |flat: &Flat| (flat.width, flat.height) == (first.width, first.height);

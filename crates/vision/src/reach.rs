@@ -11,7 +11,7 @@ use core::f64::consts::{PI, TAU};
 
 /// Steps in which a profile is looked at.
 const STEPS: usize = 64;
-/// Directions whose median is what is round.
+/// Directions whose median is the round part.
 const DIRECTIONS: usize = 8;
 
 /// Distance from its centre beyond which the image of a bead of a contrast over the noise of a pixel may be left out, px. `profile`
@@ -25,11 +25,11 @@ pub(crate) fn extent_px(profile: impl Fn(f64) -> f64, end_px: f64, snr: f64) -> 
     edge((0..STEPS).map(ring)) as f64 * step_px
 }
 
-/// As [`extent_px`], of beads in frames: `rest` is what is left of the frames without the beads' images.
+/// As [`extent_px`], of beads in frames: `rest` are the frames without the beads' images.
 ///
-/// An image is round, its surroundings are not: a wall or a neighbour lies in some directions. What is round is the median of the
-/// directions about the beads. The product of those of two halves of the beads has its square as mean, without the noise's.
-/// A constant is no part of the image: each window has a level.
+/// An image is round, and its surroundings are not: a wall or a neighbour is on one side. So the round part is the median of the
+/// directions about the beads. Each half of the beads has a median. The mean of their product is the square of the round part: noise
+/// adds nothing to it. A constant is no part of the image, since each window has a level.
 pub(crate) fn round_extent_px(
     rest: &[Flat],
     template: &Template,
@@ -54,10 +54,10 @@ pub(crate) fn round_extent_px(
         off + f64::from(template.value_at_squared((r_px * r_px) as f32))
     };
     let [a, b] = &halves;
-    // Each window has a level of its own: only what differs from the mean beyond counts.
+    // Only the difference from the mean of the rings beyond counts: each window has a level.
     let (mut area, mut of_a, mut of_b, mut of_both) = (0.0, 0.0, 0.0, 0.0);
     let within = (0..STEPS).rev().find(|k| {
-        let ring_px2 = 2.0 * PI * (*k as f64 + 0.5) * step_px * step_px;
+        let ring_px2 = TAU * (*k as f64 + 0.5) * step_px * step_px;
         let (a, b) = (round(a, *k), round(b, *k));
         area += ring_px2;
         of_a += ring_px2 * a;

@@ -101,60 +101,49 @@ pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
 /// Searches in the frames, and again without their scene: walls, dust, uneven light. A bead that keeps its distance from a wall would
 /// have the wall in its profile, and dust outnumbers beads.
 ///
-/// The scene is the median, over the frames, of what the beads do not explain. Each search gives beads that explain more. A search
-/// counts unless it finds fewer beads than the one before.
+/// The scene is the median of the frames without the images of their beads. Each search finds beads whose images are nearer to the true
+/// ones. A search counts unless it finds fewer beads than the one before.
 fn found_in_scene(
     frames: &[Frame],
     search: impl Fn(&[Flat]) -> Result<Found, NothingToSuggest>,
 ) -> Result<Suggestion, NothingToSuggest> {
     let flats: Vec<Flat> = frames.iter().map(Flat::new).collect();
-    let without_scene = |beads: Option<&Found>| {
-        let template = beads.and_then(|found| found.suggestion.config.template().ok());
-        let scene = match (beads, template) {
-            (Some(found), Some(template)) => {
-                objects::scene(&without_beads(&flats, &template, &found.fits))?
-            }
-            _ => objects::scene(&flats)?,
-        };
+    let search_without_scene = |rest: &[Flat]| {
+        let scene = objects::scene(rest)?;
         let mut flats = flats.clone();
         flats.iter_mut().for_each(|flat| flat.subtract(&scene));
-        Some(search(&flats))
+        search(&flats).ok()
     };
     let mut found = search(&flats);
     let count = frames.len();
-    let standing = found.as_ref().is_ok_and(|found| found.stands(count));
-    // What stands may be dust that outnumbers the beads: it is part of the median of the frames themselves.
-    if standing || found.is_err() {
-        let others = without_scene(None);
-        if let Some(Ok(others)) = others
-            && (2 * others.fits.len() > count || !standing)
-            && found
-                .as_ref()
-                .map_or(true, |found| others.are_elsewhere(found))
-        {
-            found = Ok(others);
-        }
-    }
+    // Dust that stands still and outnumbers the beads is part of the median of the frames themselves.
+    let others = match &found {
+        Ok(first) if first.stands(count) => search_without_scene(&flats)
+            .filter(|others| 2 * others.fits.len() > count && others.are_elsewhere(first)),
+        Ok(_) => None,
+        Err(_) => search_without_scene(&flats),
+    };
+    found = others.map_or(found, Ok);
     for _ in 0..SCENES {
-        // Where beads rest, nothing tells their images from what is behind them.
+        // Where beads rest, nothing tells their images from the scene behind them.
         let Ok(known) = &found else { break };
         if known.stands(count) {
             break;
         }
-        match without_scene(Some(known)) {
-            Some(Ok(next)) if !next.has_fewer_than(known) => found = Ok(next),
+        let rest = without_beads(&flats, &known.template, &known.fits);
+        match search_without_scene(&rest) {
+            Some(next) if !next.has_fewer_than(known) => found = Ok(next),
             _ => break,
         }
     }
     found.map(|found| found.suggestion)
 }
 
-/// A suggestion and the fixes behind it, with their frames, in their order.
+/// A suggestion, its template, and the fixes behind it with their frames, in the order of these.
 struct Found {
     suggestion: Suggestion,
+    template: Template,
     fits: Vec<(usize, Fix)>,
-    /// Of the template.
-    radius_px: f64,
 }
 
 impl Found {
@@ -173,8 +162,9 @@ impl Found {
 
     /// Number of fixes within a radius of a place.
     fn near(&self, place: &Fix) -> usize {
+        let radius_px = self.template.radius_px();
         let near = |(_, fix): &&(usize, Fix)| {
-            squared(fix.x_px - place.x_px, fix.y_px - place.y_px) < self.radius_px.powi(2)
+            squared(fix.x_px - place.x_px, fix.y_px - place.y_px) < radius_px.powi(2)
         };
         self.fits.iter().filter(near).count()
     }
@@ -293,7 +283,7 @@ fn learn(
     let mut config = None;
     let mut template: Option<Template> = None;
     let mut fits: Vec<(usize, Fix)> = Vec::new();
-    let (mut filled, mut radius_px) = (1.0_f64, region_px);
+    let mut filled = 1.0_f64;
     for pass in 0..PASSES {
         let rings = collect(flats, &beads, template.as_ref(), least_px);
         let parametric = rings.parametric().ok_or(failed)?;
@@ -315,7 +305,6 @@ fn learn(
         template = settings.template().ok();
         snr = median(fits.iter().map(|(_, f)| f.snr));
         filled = localiser.filled();
-        radius_px = localiser.template().radius_px();
         if fits.len() * 2 < objects && pass + 1 == PASSES {
             return Err(failed);
         }
@@ -346,8 +335,8 @@ fn learn(
     };
     Ok(Found {
         suggestion,
+        template: template.ok_or(failed)?,
         fits,
-        radius_px,
     })
 }
 
