@@ -9,7 +9,7 @@ import argparse
 import threading
 import time
 
-from pypylon import pylon
+from pypylon import genicam, pylon
 
 import cellpos
 
@@ -34,8 +34,20 @@ def grabbed():
     # emulated one has no TimeStamp.
     offset_ns = None
     camera.StartGrabbing(pylon.GrabStrategy_LatestImageOnly)
+    lost_in_a_row = 0
     while camera.IsGrabbing():
-        with camera.RetrieveResult(2000, pylon.TimeoutHandling_ThrowException) as result:
+        try:
+            result = camera.RetrieveResult(2000, pylon.TimeoutHandling_ThrowException)
+        except genicam.TimeoutException:
+            raise
+        except genicam.GenericException:
+            # A frame that a newer one replaced while it was fetched is a lost frame. Without any for a second the camera is gone.
+            lost_in_a_row += 1
+            if lost_in_a_row > options.rate:
+                raise
+            continue
+        lost_in_a_row = 0
+        with result:
             if not result.GrabSucceeded():
                 continue
             now_ns, stamp_ns = time.monotonic_ns(), result.TimeStamp

@@ -13,7 +13,7 @@ use cellpos_rig::source::{
     Camera, CameraError, FrameBuffer, FrameStamp, FrameWatch, PositionSource, SeenFrame, SourceInfo,
 };
 use cellpos_vision::{
-    Cell, CellTracker, Commanded, Decision, FixQuality, Frame, TrackState, TrackStep, Tracker,
+    Cell, CellTracker, Commanded, Decision, Fix, FixQuality, Frame, TrackState, TrackStep, Tracker,
 };
 
 /// What is followed.
@@ -107,6 +107,15 @@ pub struct VisionSource<C> {
     account: FrameAccount,
     /// Time stamp of the newest frame looked at.
     newest_ns: Option<i64>,
+    /// From frame to frame.
+    period_ns: i64,
+    /// How long the last look took, ns.
+    look_ns: i64,
+    /// A frame that has come and waits in `ahead`.
+    waiting: Option<FrameStamp>,
+    ahead: FrameBuffer,
+    /// Where the last look expected the object, px, and its standard deviation.
+    expected: ((f64, f64), f64),
     watches: Vec<Box<dyn FrameWatch>>,
 }
 
@@ -149,6 +158,11 @@ impl<C: Camera> VisionSource<C> {
             noise_free: false,
             first_ns: None,
             newest_ns: None,
+            period_ns,
+            look_ns: 0,
+            waiting: None,
+            ahead: FrameBuffer::default(),
+            expected: ((f64::NAN, f64::NAN), f64::INFINITY),
             watches: Vec::new(),
         }
     }
@@ -178,22 +192,25 @@ impl<C: Camera> VisionSource<C> {
         self
     }
 
-    /// Processes the frame in the buffer; `None` if it is not new ([`FrameAccount`]) or repeats the picture before.
-    fn look(
-        &mut self,
-        stamp: &FrameStamp,
-    ) -> Result<Option<(TrackStep, Option<Cell>)>, CameraError> {
-        let at_ns = stamp.mid_exposure_ns;
-        let judged = self.account.step(stamp.id, at_ns, stamp.arrival_ns);
-        if !judged.kind.is_new() {
-            return Ok(None);
-        }
+    /// Whether the frame in the buffer is new ([`FrameAccount`]) and does not repeat the picture before.
+    fn is_new(&mut self, stamp: &FrameStamp) -> bool {
+        let judged = self
+            .account
+            .step(stamp.id, stamp.mid_exposure_ns, stamp.arrival_ns);
         // The comparison ends at the first pixel that differs.
-        if !self.noise_free && self.buffer == self.before {
-            return Ok(None);
-        }
+        judged.kind.is_new() && (self.noise_free || self.buffer != self.before)
+    }
+
+    /// Processes the frame in the buffer.
+    fn look(&mut self, stamp: &FrameStamp) -> Result<(TrackStep, Option<Cell>), CameraError> {
+        let from_ns = self.clock.now_ns();
+        let at_ns = stamp.mid_exposure_ns;
         let before_ns = self.newest_ns.replace(at_ns);
-        let first_ns = *self.first_ns.get_or_insert(at_ns);
+        let first_ns = *self.first_ns.get_or_insert_with(|| {
+            // Its size is known now: nothing is allocated later.
+            self.ahead.clone_from(&self.buffer);
+            at_ns
+        });
         let mean_px_per_s = |from_ns, to_ns| {
             let um_per_s = self
                 .flow
@@ -214,34 +231,60 @@ impl<C: Camera> VisionSource<C> {
             exposure_s: exposed_s,
         };
         let time_s = (at_ns - first_ns) as f64 * 1e-9;
-        self.followed
+        let seen = self
+            .followed
             .step(&self.buffer.frame(), time_s, commanded)
-            .map(Some)
             .map_err(|error| CameraError::Broken {
                 camera: self.camera.info().name,
                 problem: error.to_string(),
                 remedy:
                     "record the background again, as this camera is set now: cellpos background"
                         .to_string(),
-            })
+            })?;
+        self.expected = ((seen.0.x_px, seen.0.y_px), seen.0.sd_px);
+        self.look_ns = self.clock.now_ns() - from_ns;
+        Ok(seen)
+    }
+
+    /// The next frame, in the buffer; the one before it goes to `before`. `None` if none came in time.
+    fn take(&mut self, deadline_ns: i64) -> Result<Option<FrameStamp>, CameraError> {
+        std::mem::swap(&mut self.buffer, &mut self.before);
+        if let Some(stamp) = self.waiting.take() {
+            std::mem::swap(&mut self.buffer, &mut self.ahead);
+            return Ok(Some(stamp));
+        }
+        let taken = self.camera.next_frame(&mut self.buffer, deadline_ns)?;
+        if taken.is_none() {
+            std::mem::swap(&mut self.buffer, &mut self.before);
+        }
+        Ok(taken)
+    }
+
+    /// Whether a newer frame than the one in the buffer has come already, so that a look at this one would only make the newer one old.
+    /// Asked after a look that took longer than a frame: the frames that come during such looks can never all be looked at.
+    fn is_overtaken(&mut self) -> bool {
+        if self.look_ns > self.period_ns {
+            // A camera that has ended says so again when the frame in the buffer has been dealt with.
+            self.waiting = self.camera.next_frame(&mut self.ahead, 0).unwrap_or(None);
+        }
+        self.waiting.is_some()
     }
 }
 
 impl<C: Camera> VisionSource<C> {
-    fn show(&mut self, stamp: &FrameStamp, step: &TrackStep, cell: Option<&Cell>) {
+    fn show(&mut self, stamp: &FrameStamp, taken: Option<&Fix>, cell: Option<&Cell>) {
         if self.watches.is_empty() {
             return;
         }
-        let taken = step.decision.is_accepted();
         let seen = SeenFrame {
             frame: self.buffer.frame(),
             bits: self.buffer.bits,
             stamp: *stamp,
-            centre_px: taken.then_some((step.fix.x_px, step.fix.y_px)),
+            centre_px: taken.map(|fix| (fix.x_px, fix.y_px)),
             half_px: self.followed.half_px(cell),
             outline_px: self.followed.outline(cell),
-            expected_px: (step.x_px, step.y_px),
-            expected_sd_px: step.sd_px,
+            expected_px: self.expected.0,
+            expected_sd_px: self.expected.1,
             scale: self.calibration.picture_scale(),
         };
         for watch in &mut self.watches {
@@ -252,20 +295,23 @@ impl<C: Camera> VisionSource<C> {
 
 impl<C: Camera> PositionSource for VisionSource<C> {
     fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError> {
-        std::mem::swap(&mut self.buffer, &mut self.before);
-        let Some(stamp) = self.camera.next_frame(&mut self.buffer, deadline_ns)? else {
-            std::mem::swap(&mut self.buffer, &mut self.before);
+        let Some(stamp) = self.take(deadline_ns)? else {
             return Ok(None);
         };
-        let (step, cell) = match self.look(&stamp)? {
-            Some((step, cell)) => (Some(step), cell),
-            None => (None, None),
-        };
-        if let Some(step) = &step {
-            self.show(&stamp, step, cell.as_ref());
+        let (mut decision, mut step, mut cell) = (Decision::Stale, None, None);
+        if self.is_new(&stamp) {
+            if self.is_overtaken() {
+                decision = Decision::PassedOver;
+            } else {
+                let (seen, of_cell) = self.look(&stamp)?;
+                (decision, step, cell) = (seen.decision, Some(seen), of_cell);
+            }
         }
         let fix = step.map(|s| s.fix);
-        let taken = step.filter(|s| s.decision.is_accepted()).map(|s| s.fix);
+        let taken = fix.filter(|_| decision.is_accepted());
+        if decision != Decision::Stale {
+            self.show(&stamp, taken.as_ref(), cell.as_ref());
+        }
         let c = &self.calibration;
         Ok(Some(Measurement {
             frame_id: stamp.id,
@@ -276,9 +322,7 @@ impl<C: Camera> PositionSource for VisionSource<C> {
                 c.variance_um2(f.var_x_px2, f.var_y_px2, f.cov_xy_px2)
             }),
             verdict: fix.map_or(FixQuality::NoSignal, |f| f.verdict),
-            track: Some(step.map_or((self.followed.state(), Decision::Stale), |s| {
-                (s.state, s.decision)
-            })),
+            track: Some((step.map_or(self.followed.state(), |s| s.state), decision)),
             length_um: cell.map_or(f64::NAN, |cell| c.length_um(&cell)),
             area_um2: cell.map_or(f64::NAN, |cell| c.area_um2(&cell)),
             length_sd_um: cell.map_or(f64::NAN, |cell| c.length_sd_um(&cell)),

@@ -139,6 +139,8 @@ pub enum FreezeReason {
     Unrecorded,
     /// Commands do not reach the board, or its reports do not come.
     LineStalled,
+    /// Vision takes longer for a frame than the camera, and frames are too old when it has finished.
+    VisionSlow,
 }
 
 /// Why arming was refused.

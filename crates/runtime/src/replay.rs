@@ -205,7 +205,7 @@ fn input(record: &TickRecord, previous: Option<&TickRecord>) -> TickInput {
         previous_late_ns: previous
             .filter(|p| p.flags.has(TickFlags::LATE))
             .map(|p| p.compute_ns),
-        slow_vision_ns: None,
+        slow_vision_ns: record.flags.has(TickFlags::VISION_SLOW).then_some(0),
         board_trouble: record
             .flags
             .has(TickFlags::BOARD_TROUBLE)

@@ -14,6 +14,7 @@ use crate::tick::Heard;
 use crate::ticker::{Account, Order, Ticker};
 use cellpos_control::{Adaptation, LearnedTable};
 use cellpos_rig::{Actuator, ActuatorError, ActuatorReport, Clock, Measurement, PositionSource};
+use cellpos_vision::Decision;
 use rtrb::{Consumer, Producer};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -117,7 +118,9 @@ impl<'a> Seeing<'a> {
         };
         // A full ring means that control has not run for a second; the gap in the frame ids tells the rest.
         let _ = self.measurements.push(measurement);
-        if had_waited {
+        // A frame that was passed over says nothing of how long a look takes.
+        let passed = matches!(measurement.track, Some((_, Decision::PassedOver)));
+        if had_waited && !passed {
             self.backlog = self.backlog.saturating_add(1);
             self.backlog_ns = self
                 .backlog_ns

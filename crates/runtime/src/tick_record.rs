@@ -63,6 +63,9 @@ impl TickFlags {
     /// The slow partner is at an end of its range.
     pub const PARTNER_LIMITED: u32 = 1 << 23;
 
+    /// Vision takes longer for a frame than the camera.
+    pub const VISION_SLOW: u32 = 1 << 24;
+
     /// Whether all bits of `mask` are set.
     pub fn has(self, mask: u32) -> bool {
         self.0 & mask == mask

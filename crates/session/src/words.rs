@@ -79,6 +79,7 @@ fn freeze_reason(reason: FreezeReason) -> &'static str {
         FreezeReason::Operator => "the operator asked for it",
         FreezeReason::BeadLost => "the bead is not seen",
         FreezeReason::CameraStalled => "no frames come",
+        FreezeReason::VisionSlow => "vision takes longer for a frame than the camera",
         FreezeReason::LineStalled => "the line to the board is stalled",
         FreezeReason::PictureFrozen => "the camera gives the same picture again and again",
         FreezeReason::NotFollowing => {

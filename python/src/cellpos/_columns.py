@@ -36,6 +36,7 @@ WORDS: Dict[str, Dict[int, str]] = {
                 "stays",
                 "in-contact",
                 "near-limit",
+                "passed-over",
             )
         )
     ),
@@ -165,6 +166,7 @@ FLAGS: Dict[str, int] = {
             "partner-heard",
             "partner-lost",
             "partner-limited",
+            "vision-slow",
         )
     )
 }

@@ -25,6 +25,7 @@ fn ring() -> ProfileSpec {
 struct Scripted {
     frames: Vec<(FrameStamp, Vec<u8>)>,
     next: usize,
+    rate_hz: f64,
 }
 
 impl Scripted {
@@ -32,6 +33,7 @@ impl Scripted {
         Self {
             frames: Vec::new(),
             next: 0,
+            rate_hz: 1000.0,
         }
     }
 
@@ -85,7 +87,7 @@ impl Camera for Scripted {
             name: "script".to_string(),
             width_px: WIDTH,
             height_px: HEIGHT,
-            rate_hz: 1000.0,
+            rate_hz: self.rate_hz,
             latency_ms: 2.0,
             field_um: [0.0, 0.0],
         }
@@ -329,4 +331,45 @@ fn the_same_picture_under_new_numbers_is_stale() {
         assert_eq!(stale, (5..9).contains(&n), "frame {n}: {m:?}");
         assert_eq!(m.is_usable(), !stale, "frame {n}: {m:?}");
     }
+}
+
+/// Counts the frames that it is shown, and those with a fix.
+struct Counting(Arc<Mutex<(u32, u32)>>);
+
+impl FrameWatch for Counting {
+    fn frame(&mut self, seen: &SeenFrame) {
+        let mut counted = self.0.lock().unwrap();
+        counted.0 += 1;
+        counted.1 += u32::from(seen.centre_px.is_some());
+    }
+}
+
+#[test]
+fn of_the_frames_that_came_during_a_long_look_the_newest_is_looked_at_and_none_is_lost() {
+    let template = template();
+    // A camera so fast that each look takes longer than a frame; all frames have come.
+    let mut camera = Scripted::new();
+    camera.rate_hz = 1e9;
+    for n in 0..20 {
+        camera.frame(&template, n as u64, n * PERIOD_NS, &[(30.0, 32.0, 1.0)]);
+    }
+    let localiser = Localiser::new(LocaliserConfig::new(ring())).unwrap();
+    let tracker = Tracker::new(localiser, TrackerConfig::default()).unwrap();
+    let mut source = VisionSource::new(camera, tracker, straight(), Clock::Real);
+    let counted = Arc::default();
+    assert!(source.watch(Box::new(Counting(Arc::clone(&counted)))));
+    let seen = all(&mut source);
+    assert_eq!(
+        seen.iter().map(|m| m.frame_id).collect::<Vec<_>>(),
+        (0..20).collect::<Vec<_>>()
+    );
+    for (n, m) in seen.iter().enumerate() {
+        let passed = matches!(m.track, Some((_, Decision::PassedOver)));
+        assert_eq!(passed, !(n == 0 || n == 19), "frame {n}: {m:?}");
+        assert!(!(passed && m.is_usable()), "frame {n}: {m:?}");
+    }
+    // The first look finds the bead, the next confirms it.
+    assert_eq!(seen[19].track.unwrap().1, Decision::Confirming);
+    let shown = *counted.lock().unwrap();
+    assert_eq!(shown, (20, 0));
 }

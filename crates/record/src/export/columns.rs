@@ -119,6 +119,7 @@ pub const DECISION: Codes = &[
     (14, "stays"),
     (15, "in-contact"),
     (16, "near-limit"),
+    (17, "passed-over"),
 ];
 /// States of a run.
 pub const LIFE: Codes = &[(0, "disarmed"), (1, "armed"), (2, "running"), (3, "safe")];

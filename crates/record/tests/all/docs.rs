@@ -65,6 +65,7 @@ fn every_bit_of_the_flags_is_on_the_page() {
         ("partner-heard", TickFlags::PARTNER_HEARD),
         ("partner-lost", TickFlags::PARTNER_LOST),
         ("partner-limited", TickFlags::PARTNER_LIMITED),
+        ("vision-slow", TickFlags::VISION_SLOW),
     ] {
         assert!(page.contains(&format!("| {value} | {name} |")), "{name}");
     }

@@ -67,13 +67,17 @@ impl<R: ReferenceGenerator> Core<R> {
         tick: &mut Tick,
     ) -> Option<LoopMeasurement> {
         self.tell_frames(&input.frames, tick);
+        let is_slow = input.slow_vision_ns.is_some();
+        if is_slow {
+            tick.flags.set(TickFlags::VISION_SLOW);
+        }
         let slow = EventKind::VisionSlowStarted {
             vision_ms: f64::from(input.slow_vision_ns.unwrap_or(0)) * 1e-6,
             period_ms: self.frame_period_ns() as f64 * 1e-6,
         };
         tick.span(
             &mut self.state.vision_slow_since_ns,
-            input.slow_vision_ns.is_some(),
+            is_slow,
             slow,
             |lasted_ms| EventKind::VisionSlowEnded { lasted_ms },
         );
@@ -89,12 +93,14 @@ impl<R: ReferenceGenerator> Core<R> {
                 tick.disturbed = true;
                 // A stall of this machine makes frames old, not the camera. The camera's path delivers faster than the camera exposes, so
                 // these frames have come when the stall is over for as long as it lasted. The last one may still take `oldest_ms`.
-                if tick.time_ns >= self.state.caught_up_ns {
+                // Nor does slow vision: the camera's frames are right, and each that comes too late is one that is missing. Before the
+                // run nothing is held that could be waited for.
+                let awaited = is_slow && self.state.life == Life::Running;
+                if tick.time_ns >= self.state.caught_up_ns && !awaited {
                     self.state.stale_in_a_row = self.state.stale_in_a_row.saturating_add(1);
                 }
                 if self.state.stale_in_a_row >= self.timing.faults_in_a_row {
-                    let slow = self.state.vision_slow_since_ns.is_some();
-                    let reason = if slow {
+                    let reason = if is_slow {
                         SafeReason::VisionSlow
                     } else {
                         SafeReason::StaleFrames

@@ -13,11 +13,12 @@ use cellpos_control::Mode;
 const REPEATED_PICTURES: u32 = 3;
 
 /// Reasons to stop the bead for which the newest estimate of the zero flow may be what went wrong.
-const BLIND: [FreezeReason; 4] = [
+const BLIND: [FreezeReason; 5] = [
     FreezeReason::BeadLost,
     FreezeReason::CameraStalled,
     FreezeReason::PictureFrozen,
     FreezeReason::NotFollowing,
+    FreezeReason::VisionSlow,
 ];
 
 /// The reasons for which the bead is frozen at present. Control resumes when the last one is gone.
@@ -129,6 +130,8 @@ impl<R: ReferenceGenerator> Core<R> {
                 (FreezeReason::PictureFrozen, SafeReason::StaleFrames)
             } else if self.state.frameless > self.planned_gap {
                 (FreezeReason::CameraStalled, SafeReason::CameraLost)
+            } else if self.state.vision_slow_since_ns.is_some() {
+                (FreezeReason::VisionSlow, SafeReason::VisionSlow)
             } else {
                 (FreezeReason::BeadLost, SafeReason::BeadLost)
             };
@@ -140,6 +143,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 self.thaw(FreezeReason::BeadLost, tick);
                 self.thaw(FreezeReason::CameraStalled, tick);
                 self.thaw(FreezeReason::PictureFrozen, tick);
+                self.thaw(FreezeReason::VisionSlow, tick);
             }
         }
         let frozen = self.state.frozen;

@@ -255,6 +255,26 @@ fn vision_slower_than_the_camera_ends_the_run_by_its_name() {
 }
 
 #[test]
+fn vision_that_is_slow_for_a_while_is_waited_for_as_a_camera_that_stalls() {
+    for (until_ms, lasts) in [(2_030, true), (2_200, true), (6_000, false)] {
+        let faults = Faults {
+            vision_slow: Some((2_000 * MS, until_ms * MS, 4 * MS)),
+            ..Faults::default()
+        };
+        let ran = run(5, 6000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        let expected = (!lasts).then_some(SafeReason::VisionSlow);
+        assert_eq!(end.safe_reason, expected, "slow until {until_ms} ms");
+        let frozen = ran.events.iter().any(|event| {
+            let reason = crate::life::FreezeReason::VisionSlow;
+            matches!(event.kind, crate::life::EventKind::FreezeStarted { reason: r, .. } if r == reason)
+        });
+        assert!(frozen || until_ms == 2_030, "slow until {until_ms} ms");
+    }
+}
+
+#[test]
 fn each_thread_that_dies_ends_the_run_by_its_name() {
     for thread in [
         Thread::Camera,

@@ -49,6 +49,8 @@ pub(super) struct Faults {
     /// The camera restarts its count at this frame.
     pub(super) restarts_at: Option<u64>,
     pub(super) vision_ns: (i64, i64),
+    /// From, until, and how long each frame takes in between, ns.
+    pub(super) vision_slow: Option<(i64, i64, i64)>,
     /// Probability that a thread is not run for a while, and how long, ns.
     pub(super) stall: f64,
     pub(super) stall_ns: i64,
@@ -94,6 +96,7 @@ impl Default for Faults {
             first: (0, 70_000, 0),
             restarts_at: None,
             vision_ns: (100_000, 150_000),
+            vision_slow: None,
             stall: 0.0,
             stall_ns: 0,
             slow_tick: 0.0,
@@ -373,7 +376,12 @@ impl PositionSource for Source {
         }
         let (_, mut m) = self.queue.pop_front().expect("asked above");
         let (least, most) = self.faults.vision_ns;
-        let ready_ns = now_ns + self.dice.within(least, most);
+        let takes_ns = self.dice.within(least, most);
+        let slow = self
+            .faults
+            .vision_slow
+            .filter(|(from_ns, until_ns, _)| (*from_ns..*until_ns).contains(&now_ns));
+        let ready_ns = now_ns + slow.map_or(takes_ns, |(_, _, ns)| ns);
         self.clock.sleep_until_ns(ready_ns);
         m.ready_ns = ready_ns;
         Ok(Some(m))

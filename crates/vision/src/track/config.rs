@@ -263,6 +263,8 @@ pub enum Decision {
     InContact = 15,
     /// The fix was taken, but noise, focus or blur near the end of the range that the settings hold for: beyond it there is no fix.
     NearLimit = 16,
+    /// The look at the frame before took longer than a frame, and a newer frame had come: not looked at.
+    PassedOver = 17,
 }
 
 impl Decision {
@@ -287,6 +289,7 @@ impl Decision {
             Stays,
             InContact,
             NearLimit,
+            PassedOver,
         ]
         .into_iter()
         .find(|decision| *decision as u8 == number)
