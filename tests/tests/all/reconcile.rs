@@ -70,6 +70,7 @@ fn a_leak_twice_above_the_threshold_is_named() {
 }
 
 #[test]
+#[ignore = "14 s of a debug build: for .ci/nightly"]
 fn a_lag_too_short_to_tell_its_kind_is_ambiguous_with_every_kind_and_the_experiment_that_would_tell()
  {
     let result = run(&hiding(Hidden::Delay(1.05e-5), 14)).unwrap();
@@ -90,6 +91,7 @@ fn a_lag_too_short_to_tell_its_kind_is_ambiguous_with_every_kind_and_the_experim
 }
 
 #[test]
+#[ignore = "11 s of a debug build: for .ci/nightly"]
 fn a_play_between_flanks_that_give_way_is_backlash() {
     let rounded = Hidden::Second(Second::RoundedPlay(0.2));
     let result = run(&hiding(rounded, 15)).unwrap();
@@ -114,6 +116,7 @@ fn drawn_cases_differ_by_seed_and_are_the_same_for_one() {
 }
 
 #[test]
+#[ignore = "26 s of a debug build: for .ci/nightly"]
 fn a_stranger_of_a_seed_gets_no_name_and_a_noise_that_is_slow_or_in_steps_none_either() {
     let jitter = Hidden::Stranger(Stranger::FrameJitter(5e-4));
     let cases = [

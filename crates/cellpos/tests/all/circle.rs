@@ -57,6 +57,7 @@ fn a_delay_that_nobody_told_of_is_found_and_the_margins_come_back() {
 }
 
 #[test]
+#[ignore = "16 s of a debug build: for .ci/nightly"]
 fn a_lag_of_the_driver_is_found_and_tracking_gets_better_for_it() {
     let folder = tempfile::tempdir().unwrap();
     hide(folder.path(), "hidden.toml", effects::driver_lag(80.0));

@@ -56,6 +56,7 @@ fn an_error_that_the_model_states_is_no_effect() {
 }
 
 #[test]
+#[ignore = "18 s of a debug build: for .ci/nightly"]
 fn an_effect_beside_it_has_its_name_and_an_interval_with_that_error_in_it() {
     let r = beside_a_long_delay(Hidden::Lag(120.0), true, 4, 82);
     assert_eq!(ids(&r), ["driver-lag"], "{:?}", r.places);

@@ -91,6 +91,7 @@ fn an_effect_is_named_beside_slow_noise() {
 }
 
 #[test]
+#[ignore = "13 s of a debug build: for .ci/nightly"]
 fn noise_that_is_said_to_be_white_makes_slow_noise_an_error() {
     let r = run(&plant(), NoiseKind::White);
     assert!(r.noise.coloured.is_none() && r.noise.walk_um2 == 0.0);

@@ -144,6 +144,7 @@ fn on_this_rig(hidden: &Model, rows: usize) -> Vec<Record> {
 }
 
 #[test]
+#[ignore = "26 s of a debug build: for .ci/nightly"]
 fn a_small_effect_of_its_own_is_named_beside_a_large_one() {
     let hidden = Model::eq6()
         .with_effect(effects::time_delay(0.006))
@@ -193,6 +194,7 @@ fn pixels_see_what_a_hum_shakes() {
 }
 
 #[test]
+#[ignore = "16 s of a debug build: for .ci/nightly"]
 fn a_hysteresis_that_any_curve_explains_is_no_name() {
     // A clip whose knee is round, nearly as wide as the clip: beside a sharp one a hysteresis would explain it.
     let r = behind(|u| {
