@@ -6,5 +6,6 @@ mod imperfections;
 mod line;
 mod rig_in_a_box;
 mod scene;
+mod suggested;
 mod world;
 mod world_faults;
