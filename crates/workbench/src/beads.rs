@@ -35,6 +35,8 @@ pub struct FoundBeads {
     pub refused: [usize; 3],
     /// Median contrast over noise.
     pub snr: f64,
+    /// Whether it moved by less than its radius, as dirt does: a free bead of 1 um diffuses by more in a second.
+    pub rests: bool,
     /// How the loop's tracker sees with these settings.
     pub sight: Sight,
 }
@@ -85,6 +87,7 @@ pub fn find(
 /// The settings and the tracker's result with them.
 fn tried(bench: &Bench, capture: &Capture, found: Suggestion) -> Result<FoundBeads, Failure> {
     let localiser = Localiser::new(found.config.clone()).map_err(Failure::input)?;
+    let radius_px = localiser.template().radius_px();
     let sight = Sight::of_bead(bench, localiser, &capture.frames)?;
     if 2 * sight.seen < sight.frames.max(1) {
         return Err(Failure::Failed(miette::miette!(
@@ -107,6 +110,7 @@ fn tried(bench: &Bench, capture: &Capture, found: Suggestion) -> Result<FoundBea
         ],
         snr: found.snr,
         vision: found.config,
+        rests: sight.way_px < radius_px,
         sight,
     })
 }

@@ -23,6 +23,8 @@ pub struct Sight {
     pub stated_px: f64,
     /// The same from the steps between successive frames, px; none if the bead's own motion hides it.
     pub measured_px: Option<f64>,
+    /// Farthest that it went between two frames, however far apart, px.
+    pub way_px: f64,
     /// Contrast over noise, median.
     pub snr: f64,
     /// Time of looking at a frame, median and 99 of 100, us.
@@ -50,6 +52,7 @@ impl Sight {
         let start_ns = frames.first().map_or(0, |kept| kept.stamp.mid_exposure_ns);
         let mut places = Vec::with_capacity(frames.len());
         let (mut sds, mut snrs, mut times_us) = (Vec::new(), Vec::new(), Vec::new());
+        let mut box_px: Option<[f64; 4]> = None;
         for kept in frames {
             let time_s = (kept.stamp.mid_exposure_ns - start_ns) as f64 * 1e-9;
             let began = std::time::Instant::now();
@@ -58,6 +61,14 @@ impl Sight {
             if let Some(seen) = seen {
                 sds.push(seen.sd_px);
                 snrs.push(seen.snr);
+                let [left, right, top, bottom] =
+                    box_px.unwrap_or([seen.x_px, seen.x_px, seen.y_px, seen.y_px]);
+                box_px = Some([
+                    left.min(seen.x_px),
+                    right.max(seen.x_px),
+                    top.min(seen.y_px),
+                    bottom.max(seen.y_px),
+                ]);
             }
             places.push((kept.stamp.id, seen.map(|seen| seen.x_px)));
         }
@@ -71,6 +82,9 @@ impl Sight {
             before: before as u64,
             stated_px: quantile(&sds, 0.5),
             measured_px: noise_px(&places),
+            way_px: box_px.map_or(0.0, |[left, right, top, bottom]| {
+                f64::hypot(right - left, bottom - top)
+            }),
             snr: quantile(&snrs, 0.5),
             look_us: [quantile(&times_us, 0.5), quantile(&times_us, 0.99)],
         })

@@ -154,6 +154,12 @@ impl std::fmt::Display for Found {
             "seen        in {} of {} frames by the loop's tracker, {:.0} times the noise, to {:.3} px",
             sight.seen, sight.frames, sight.snr, sight.stated_px
         )?;
+        let rests = if found.rests {
+            ", less than its radius, as dirt would: move it (cellpos jog) and look again"
+        } else {
+            ""
+        };
+        writeln!(f, "moved       by {:.1} px{rests}", sight.way_px)?;
         writeln!(
             f,
             "picture     {}: is the marked object the bead?",

@@ -53,6 +53,8 @@ fn a_bead_that_the_rig_file_does_not_describe_is_found_written_into_it_and_held(
         let recall = number(sight, "seen") / number(sight, "frames");
         // Dust and a border that it swims over may cost frames; a bead that is not found costs nearly all.
         assert!(recall > 0.8, "{name}: {found}");
+        // A free bead moves; dust would rest.
+        assert_eq!(found["rests"], false, "{name}: {found}");
         let after = std::fs::read_to_string(&file).unwrap();
         for line in before.lines().filter(|line| line.contains('#')) {
             assert!(after.contains(line), "{name}: {line:?} is lost in\n{after}");
