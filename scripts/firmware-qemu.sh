@@ -4,6 +4,7 @@
 #
 #   scripts/firmware-qemu.sh          all of it
 #   scripts/firmware-qemu.sh build    the firmware for QEMU only
+#   scripts/firmware-qemu.sh loop     all but the firmware for the RP2350
 #   scripts/firmware-qemu.sh rp2350   the firmware for the RP2350 only
 #   scripts/firmware-qemu.sh install  the tools only
 set -euo pipefail
@@ -70,6 +71,6 @@ fi
 echo "firmware mps2-an386: no panic path, no double precision, no allocator"
 [ "${1:-all}" = build ] && exit 0
 
-rp2350
+[ "${1:-all}" = loop ] || rp2350
 cargo build --workspace --bin cellpos --bin firmware-sim --locked
 CELLPOS_FIRMWARE="$firmware" cargo test --workspace --locked --test all firmware_qemu:: -- --ignored --nocapture --test-threads 1
