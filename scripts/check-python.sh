@@ -25,6 +25,7 @@ if [ $# -gt 0 ]; then
     tests "$@"
     exit
 fi
-# Three at once: most tests wait for rigs in real time. Those of cameras judge frames at 1000 a second, and have the machine to themselves.
-tests -n 3 --dist loadfile --ignore tests/test_camera.py
-tests tests/test_camera.py
+# Three at once: most tests wait for rigs in real time. Those that hold a bead through a camera of 1000 frames/s have the machine to themselves.
+alone="tests/test_camera.py tests/test_pair.py"
+tests -n 3 --dist loadfile $(printf -- '--ignore %s ' $alone)
+tests $alone
