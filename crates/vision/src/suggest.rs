@@ -139,7 +139,7 @@ fn found_in_scene(
     found.map(|found| found.suggestion)
 }
 
-/// A suggestion, its template, and the fixes behind it with their frames, in the order of these.
+/// A suggestion, its template, and the fixes behind it with their frames, in the order of the frames.
 struct Found {
     suggestion: Suggestion,
     template: Template,

@@ -52,7 +52,8 @@ impl Sight {
         let start_ns = frames.first().map_or(0, |kept| kept.stamp.mid_exposure_ns);
         let mut places = Vec::with_capacity(frames.len());
         let (mut sds, mut snrs, mut times_us) = (Vec::new(), Vec::new(), Vec::new());
-        let mut box_px: Option<[f64; 4]> = None;
+        // Least and greatest, along the rows and across.
+        let mut spans_px = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
         for kept in frames {
             let time_s = (kept.stamp.mid_exposure_ns - start_ns) as f64 * 1e-9;
             let began = std::time::Instant::now();
@@ -61,17 +62,13 @@ impl Sight {
             if let Some(seen) = seen {
                 sds.push(seen.sd_px);
                 snrs.push(seen.snr);
-                let [left, right, top, bottom] =
-                    box_px.unwrap_or([seen.x_px, seen.x_px, seen.y_px, seen.y_px]);
-                box_px = Some([
-                    left.min(seen.x_px),
-                    right.max(seen.x_px),
-                    top.min(seen.y_px),
-                    bottom.max(seen.y_px),
-                ]);
+                for ([least, most], px) in spans_px.iter_mut().zip([seen.x_px, seen.y_px]) {
+                    (*least, *most) = (least.min(px), most.max(px));
+                }
             }
             places.push((kept.stamp.id, seen.map(|seen| seen.x_px)));
         }
+        let [along_px, across_px] = spans_px.map(|[least, most]| (most - least).max(0.0));
         let before = places.iter().take_while(|(_, x)| x.is_none()).count();
         let width = frames.first().map_or(0, |kept| kept.frame.width);
         let left = frames_after_leaving(&places, width as f64);
@@ -82,9 +79,7 @@ impl Sight {
             before: before as u64,
             stated_px: quantile(&sds, 0.5),
             measured_px: noise_px(&places),
-            way_px: box_px.map_or(0.0, |[left, right, top, bottom]| {
-                f64::hypot(right - left, bottom - top)
-            }),
+            way_px: f64::hypot(along_px, across_px),
             snr: quantile(&snrs, 0.5),
             look_us: [quantile(&times_us, 0.5), quantile(&times_us, 0.99)],
         })
