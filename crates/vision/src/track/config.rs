@@ -342,7 +342,7 @@ mod tests {
             }
         }
         assert_eq!((0..=255).filter_map(TrackState::from_number).count(), 4);
-        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 17);
+        assert_eq!((0..=255).filter_map(Decision::from_number).count(), 18);
     }
 
     #[test]
