@@ -65,7 +65,6 @@ struct State {
     /// Until when frames may be old because this machine stalled, ns.
     caught_up_ns: i64,
     late_in_a_row: u32,
-    refused_in_a_row: u32,
     /// Steps of the grid in a row without a position that was used, and the steps among these that count as a loss.
     blind: u32,
     missing: u32,
@@ -209,7 +208,6 @@ impl<R: ReferenceGenerator> Core<R> {
                 stale_in_a_row: 0,
                 caught_up_ns: i64::MIN,
                 late_in_a_row: 0,
-                refused_in_a_row: 0,
                 blind: 0,
                 missing: 0,
                 frameless: 0,

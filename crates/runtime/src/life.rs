@@ -105,8 +105,6 @@ pub enum SafeReason {
     Board,
     /// Nothing was heard of the board for longer than allowed.
     LinkLost,
-    /// Commands could not be handed over, too many in a row.
-    ActuatorRingFull,
     /// The board was armed by another host.
     BoardForeign,
     /// The board obeyed no command any more, though it talked.

@@ -80,8 +80,7 @@ impl Ended {
             || matches!(
                 self.reason,
                 Some(
-                    SafeReason::ActuatorRingFull
-                        | SafeReason::Board
+                    SafeReason::Board
                         | SafeReason::BoardNotObeying
                         | SafeReason::LateTicks
                         | SafeReason::LinkLost
@@ -364,11 +363,6 @@ impl Clues {
                 " (for 100 ms)",
                 "an output within 0.2 um of the commands of the last 30 ms",
                 "check the limits of the board against [limits], and its amplifier",
-            ),
-            SafeReason::ActuatorRingFull => sentences(
-                format!(" (more than {in_a_row} in a row)"),
-                "a line that takes a command every tick",
-                "check the baud rate and the line of the board",
             ),
             SafeReason::Operator | SafeReason::ArmingRefused | SafeReason::Unrecorded => {
                 sentences("", "a loop that runs", "see events.jsonl in the run folder")

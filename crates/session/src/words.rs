@@ -62,7 +62,6 @@ pub fn safe_reason(reason: SafeReason) -> &'static str {
         SafeReason::NotFollowing => "the bead did not follow the commands, or moved against them",
         SafeReason::BoardNotFollowing => "the board's output does not follow the commands",
         SafeReason::LinkLost => "the board was not heard for longer than allowed",
-        SafeReason::ActuatorRingFull => "commands could not be handed over to the board",
         SafeReason::ArmingRefused => "the plant did not answer the arming pulse as the model says",
         SafeReason::Unrecorded => "the run could no longer be recorded",
         SafeReason::VisionSlow => {

@@ -224,15 +224,6 @@ impl<R: ReferenceGenerator> Core<R> {
             }
             None => self.state.late_in_a_row = 0,
         }
-        if input.previous_refused {
-            tick.disturbed = true;
-            self.state.refused_in_a_row = self.state.refused_in_a_row.saturating_add(1);
-            if self.state.refused_in_a_row >= self.timing.faults_in_a_row {
-                self.latch(SafeReason::ActuatorRingFull, tick);
-            }
-        } else {
-            self.state.refused_in_a_row = 0;
-        }
     }
 
     /// Nobody keeps what happens: the bead is given time to stop, then the PZT goes to park.
@@ -306,7 +297,9 @@ impl<R: ReferenceGenerator> Core<R> {
             tick.flags.set(TickFlags::COMMAND_LOST);
             tick.disturbed = true;
         }
-        if input.command_lost || holds {
+        let refused = input.previous_refused;
+        tick.disturbed |= refused;
+        if input.command_lost || refused || holds {
             state.unled = state.unled.saturating_add(1);
         } else {
             state.unled = 0;

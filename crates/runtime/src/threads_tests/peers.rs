@@ -23,6 +23,8 @@ pub(super) struct Peers {
     pub(super) frames_late_ns: Option<([i64; 2], i64)>,
     /// From one time to another the machine does not run the control thread.
     pub(super) stall_ns: Option<[i64; 2]>,
+    /// From one time to another it does not run the board's thread.
+    pub(super) board_thread_stalls_ns: Option<[i64; 2]>,
 }
 
 impl Peers {

@@ -76,6 +76,14 @@ impl Scheduler<'_> {
                 self.operator.ask(*request);
             }
         }
+        let board_stalls = self.faults.peers.board_thread_stalls_ns;
+        if let Some([from_ns, to_ns]) = board_stalls
+            && who == 2
+            && (self.start_ns + from_ns..self.start_ns + to_ns).contains(&due_ns)
+        {
+            self.next_ns[2] = self.start_ns + to_ns;
+            return true;
+        }
         let late_ns = if self.dice.hits(self.faults.stall) {
             self.dice.within(0, self.faults.stall_ns)
         } else {

@@ -42,6 +42,42 @@ fn a_line_that_stalls_for_less_than_200_ms_ends_no_run_and_one_that_stays_silent
 }
 
 #[test]
+fn a_board_thread_that_stalls_is_treated_as_a_line_that_does() {
+    // The ring for commands holds 64 of them.
+    for (stall_ms, reason) in [
+        (50, None),
+        (100, None),
+        (195, None),
+        (300, Some(SafeReason::LinkLost)),
+    ] {
+        let peers = Peers {
+            board_thread_stalls_ns: Some([1500 * MS, (1500 + stall_ms) * MS]),
+            ..Peers::default()
+        };
+        let faults = Faults {
+            peers,
+            ..Faults::default()
+        };
+        let ran = run(31, 3000, &faults, &[]);
+        check(&ran, &faults);
+        let end = ran.end.as_ref().expect("control lives");
+        assert_eq!(end.safe_reason, reason, "{stall_ms} ms");
+        let refused = |r: &&TickRecord| r.flags.has(TickFlags::ACTUATOR_RING_FULL);
+        let refused = ran.records.iter().filter(refused).count();
+        assert_eq!(refused > 20, stall_ms >= 100, "{stall_ms} ms: {refused}");
+        let furthest_um = (ran.records.iter())
+            .filter(|r| r.is_running() && r.measured_um.is_finite())
+            .map(|r| (r.measured_um - r.target_um).abs())
+            .fold(0.0, f64::max);
+        assert!(
+            reason.is_some() || furthest_um < 3.0,
+            "{stall_ms} ms: {furthest_um} um"
+        );
+        replays(&ran);
+    }
+}
+
+#[test]
 fn a_line_that_is_unplugged_and_comes_back_ends_no_run_before_the_board_is_silent_for_too_long() {
     for (away_ms, ends) in [(20, false), (150, false), (400, true)] {
         let faults = Faults {
