@@ -7,6 +7,7 @@
 use crate::fix::Fix;
 use crate::objects::Flat;
 use crate::template::{Template, span};
+use cellpos_numeric::statistics::median;
 use core::f64::consts::{PI, TAU};
 
 /// Steps in which a profile is looked at.
@@ -49,8 +50,8 @@ pub(crate) fn round_extent_px(
     let round = |half: &[[(f64, f64); DIRECTIONS]; STEPS], k: usize| {
         let r_px = (k as f64 + 0.5) * step_px;
         let seen = half[k].iter().filter(|(_, weight)| *weight > 0.0);
-        let mut off: Vec<f64> = seen.map(|(sum, weight)| sum / weight).collect();
-        let off = median(&mut off).unwrap_or(0.0);
+        let off: Vec<f64> = seen.map(|(sum, weight)| sum / weight).collect();
+        let off = if off.is_empty() { 0.0 } else { median(&off) };
         off + f64::from(template.value_at_squared((r_px * r_px) as f32))
     };
     let [a, b] = &halves;
@@ -87,19 +88,13 @@ fn add(
         (step < STEPS).then_some((step, direction, value))
     });
     let pixels: Vec<_> = pixels.collect();
-    let mut values: Vec<f64> = pixels.iter().map(|(.., value)| *value).collect();
-    let level = median(&mut values).unwrap_or(0.0);
+    let values: Vec<f64> = pixels.iter().map(|(.., value)| *value).collect();
+    let level = median(&values);
     for (step, direction, value) in pixels {
         let (sum, weight) = &mut half[step][direction];
         *sum += fix.amplitude * (value - level);
         *weight += fix.amplitude * fix.amplitude;
     }
-}
-
-fn median(values: &mut [f64]) -> Option<f64> {
-    values.sort_unstable_by(f64::total_cmp);
-    let (low, high) = (values.len().saturating_sub(1) / 2, values.len() / 2);
-    Some(0.5 * (values.get(low)? + values.get(high)?))
 }
 
 /// First ring from which on the sum is below 1.

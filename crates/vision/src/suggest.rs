@@ -18,6 +18,7 @@ use crate::range::Range;
 use crate::reach;
 use crate::smooth::Rings;
 use crate::template::Template;
+use cellpos_numeric::statistics;
 
 /// Passes of aligning and averaging.
 const PASSES: usize = 4;
@@ -459,9 +460,11 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     quantile(values, 0.5)
 }
 
-fn quantile(values: impl Iterator<Item = f64>, q: f64) -> f64 {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    let at = (sorted.len().saturating_sub(1) as f64 * q).round() as usize;
-    sorted.get(at).copied().unwrap_or(0.0)
+fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
+    let values: Vec<f64> = values.collect();
+    if values.is_empty() {
+        0.0
+    } else {
+        statistics::quantile(&values, share)
+    }
 }
