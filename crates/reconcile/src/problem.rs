@@ -5,6 +5,7 @@ use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
+use crate::data::uncertain::uncertain_command;
 use crate::data::waits::waits;
 use crate::dot::dot;
 use crate::model_error::STEP;
@@ -423,31 +424,4 @@ impl Problem {
             })
             .sum()
     }
-}
-
-/// Where rows were missing their command is a guess: how much the bead may have moved unseen \[um^2 per row\].
-fn uncertain_command(r: &Record, gain_per_sample: f64) -> Option<Vec<f64>> {
-    if !r.filled.iter().any(|f| *f) {
-        return None;
-    }
-    if r.period_rows().is_some() {
-        return None;
-    }
-    // Size of the error of a straight line between neighbours, measured where the command is known.
-    let u = &r.pzt_um;
-    let (mut sum, mut n) = (0.0, 0.0);
-    for k in 1..u.len() - 1 {
-        if !r.filled[k - 1] && !r.filled[k] && !r.filled[k + 1] {
-            sum += (u[k] - 0.5 * (u[k - 1] + u[k + 1])).powi(2);
-            n += 1.0;
-        }
-    }
-    let variance = if n > 0.0 { sum / n } else { 0.0 } * gain_per_sample * gain_per_sample;
-    let mut extra = vec![0.0; u.len()];
-    for k in 0..u.len() {
-        if r.filled[k] && k + 1 < u.len() {
-            extra[k + 1] += variance;
-        }
-    }
-    Some(extra)
 }

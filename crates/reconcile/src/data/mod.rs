@@ -12,5 +12,6 @@ pub(crate) mod no_response;
 pub(crate) mod noise;
 pub(crate) mod record;
 pub(crate) mod repeats;
+pub(crate) mod uncertain;
 pub(crate) mod waits;
 pub(crate) mod zero_flow;

@@ -144,6 +144,7 @@ fn record(
     let mut record = Record::from_rows(name, &time_s, pzt_um, bead_um).map_err(refused)?;
     record.unseen.clone_from(&acquired.unseen);
     record.frame_age_s.clone_from(&acquired.frame_age_s);
+    record.late_command.clone_from(&acquired.late_command);
     record.exposure_s = exposure_s;
     Ok(record)
 }
@@ -166,6 +167,8 @@ pub const FRAME_AGE: &str = "frame_age_s";
 /// Column of a record with the exposure of its frames.
 pub const EXPOSURE: &str = "exposure_s";
 
+/// Column of a record with 1 where a row's command did not act from the row on, as in a stall, else 0.
+pub const LATE_COMMAND: &str = "late_command";
 /// Column of a record with 1 where a row's frame came, with a bead or without, and 0 where it was dropped.
 pub const FRAME_CAME: &str = "frame_came";
 
@@ -174,6 +177,13 @@ pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
     let mut more = Vec::new();
     if !record.frame_age_s.is_empty() {
         more.push((FRAME_AGE.to_owned(), record.frame_age_s.clone()));
+    }
+    if record.late_command.contains(&true) {
+        let late = record
+            .late_command
+            .iter()
+            .map(|late| f64::from(u8::from(*late)));
+        more.push((LATE_COMMAND.to_owned(), late.collect()));
     }
     if record.unseen.contains(&true) {
         let came = (record.unseen.iter().zip(&record.bead_um))

@@ -52,7 +52,7 @@ pub(crate) struct Rows {
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
     /// The command of this row's tick came too late to stand as if on time, or never.
-    late: Vec<bool>,
+    pub(crate) late: Vec<bool>,
     /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
     /// The frame came in time and showed no reliable bead.

@@ -1,7 +1,7 @@
 //! The columns of a file: one reader for `identify`, `reconcile` and `simulate`, so that all read the same files.
 
 use super::arrays::read_table;
-use crate::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, refused};
+use crate::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, refused};
 use cellpos_numeric::units::Hertz;
 use cellpos_reconcile::Record;
 use cellpos_session::Failure;
@@ -68,9 +68,10 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
     let beside = |name: &str| table.numbers_or_nan(&ColumnRef::from(name)).ok();
     let (mut age, exposure) = (beside(FRAME_AGE).unwrap_or_default(), beside(EXPOSURE));
     let mut came = beside(FRAME_CAME).unwrap_or_default();
+    let mut late = beside(LATE_COMMAND).unwrap_or_default();
     if let Some(rows) = wanted.rows {
         let range = range_of(rows, u.len())?;
-        for values in [&mut age, &mut came] {
+        for values in [&mut age, &mut came, &mut late] {
             *values = (values.get(range.clone())).map_or_else(Vec::new, <[f64]>::to_vec);
         }
         (u, y, t) = (
@@ -87,7 +88,7 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         .collect();
     let pick = |values: &[f64]| known.iter().map(|&k| values[k]).collect::<Vec<_>>();
     let (mut u, mut y, mut t) = (pick(&u), pick(&y), pick(&t));
-    for values in [&mut age, &mut came] {
+    for values in [&mut age, &mut came, &mut late] {
         if !values.is_empty() {
             *values = pick(values);
         }
@@ -101,6 +102,7 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         (t, u, y) = even;
         age.clear();
         came.clear();
+        late.clear();
     }
     let name = path.file_stem().map_or_else(
         || path.display().to_string(),
@@ -110,6 +112,8 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
     if wanted.held {
         hold_over_gaps(&mut record);
         record.frame_age_s = in_rows(&record, &t, &age);
+        record.late_command =
+            (in_rows(&record, &t, &late).iter().map(|late| *late == 1.0)).collect();
         let came = in_rows(&record, &t, &came);
         if !came.is_empty() {
             record.unseen = (came.iter().zip(&record.bead_um))

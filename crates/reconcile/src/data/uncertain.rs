@@ -1,0 +1,87 @@
+//! Commands that are not known: rows that were missing, and stalls.
+
+use crate::data::record::Record;
+
+/// How much the bead may have moved by commands that are not known, in each row \[um^2\]; `None` if all are.
+pub(crate) fn uncertain_command(r: &Record, gain_per_sample: f64) -> Option<Vec<f64>> {
+    let guessed = r.filled.contains(&true) && r.period_rows().is_none();
+    if !guessed && !r.late_command.contains(&true) {
+        return None;
+    }
+    let mut extra = vec![0.0; r.rows()];
+    if guessed {
+        add_guessed(r, gain_per_sample, &mut extra);
+    }
+    add_late(r, gain_per_sample, &mut extra);
+    Some(extra)
+}
+
+/// Where rows were missing their command is a guess.
+fn add_guessed(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
+    // Size of the error of a straight line between neighbours, measured where the command is known.
+    let u = &r.pzt_um;
+    let (mut sum, mut n) = (0.0, 0.0);
+    for k in 1..u.len() - 1 {
+        if !r.filled[k - 1] && !r.filled[k] && !r.filled[k + 1] {
+            sum += (u[k] - 0.5 * (u[k - 1] + u[k + 1])).powi(2);
+            n += 1.0;
+        }
+    }
+    let variance = if n > 0.0 { sum / n } else { 0.0 } * gain_per_sample * gain_per_sample;
+    for k in 0..u.len() {
+        if r.filled[k] && k + 1 < u.len() {
+            extra[k + 1] += variance;
+        }
+    }
+}
+
+/// While a command does not act, the PZT is anywhere that commands were: where it was before, or where the board holds the bead. It shows in
+/// the frames until that of the next row, and these are as old as the record says.
+fn add_late(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
+    let rows = r.rows() as f64;
+    let mean_um = r.pzt_um.iter().sum::<f64>() / rows;
+    let spread_um2 = (r.pzt_um.iter())
+        .map(|um| (um - mean_um).powi(2))
+        .sum::<f64>()
+        / rows;
+    let ages = r.frame_age_s.iter().filter(|age| age.is_finite());
+    let (sum_s, count) = ages.fold((0.0, 0.0), |(sum, n), age| (sum + age, n + 1.0));
+    let age_rows = if count > 0.0 {
+        sum_s / count / r.sample_s
+    } else {
+        0.0
+    };
+    let shows = 2 + age_rows.max(0.0).ceil() as usize;
+    let late = (r.late_command.iter().enumerate()).filter(|(_, late)| **late);
+    let mut next = 0;
+    for (row, _) in late {
+        let until = (row + 1 + shows).min(extra.len());
+        for extra in &mut extra[next.max(row + 1).min(until)..until] {
+            *extra += gain_per_sample * gain_per_sample * spread_um2;
+        }
+        next = until;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_late_command_leaves_the_motion_open_until_its_frames_are_over() {
+        let time_s: Vec<f64> = (0..40).map(|k| 1e-3 * f64::from(k)).collect();
+        // Commands of +-1 um: their mean square is 1.
+        let pzt_um: Vec<f64> = (0..40).map(|k| f64::from(1 - 2 * (k % 2))).collect();
+        let mut record = Record::from_rows("r", &time_s, &pzt_um, &[0.0; 40]).expect("a record");
+        assert_eq!(uncertain_command(&record, 0.4), None);
+        record.frame_age_s = vec![2.2e-3; 40];
+        record.late_command = (0..40).map(|k| k == 10 || k == 11 || k == 38).collect();
+        let extra = uncertain_command(&record, 0.4).expect("late rows");
+        for (row, extra) in extra.iter().enumerate() {
+            // Of row 11 on: its own step, the three rows of the frames' age, and the row in which the next command begins.
+            let open = (11..=16).contains(&row) || row == 39;
+            let expected = if open { 0.16 } else { 0.0 };
+            assert!((extra - expected).abs() < 1e-12, "row {row}: {extra}");
+        }
+    }
+}
