@@ -55,7 +55,7 @@ pub(crate) fn run(args: &Args) -> Result<(), ProgramError> {
         }
         let frames = around.pace(&mut server, log.as_mut(), end_ns, &stop)?;
         if let Some(log) = &mut log {
-            log.flush()?;
+            log.finish()?;
         }
         eprintln!(
             "firmware-sim: {frames} frames sent ({} skipped for slow readers); {} codes heard, applied {:.3} um",
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &Args) -> Result<(), ProgramError> {
         &stop,
     )?;
     if let Some(log) = &mut log {
-        log.flush()?;
+        log.finish()?;
     }
     let status = rig.board().status();
     eprintln!(
