@@ -26,7 +26,7 @@ pub struct Record {
     /// From the middle of the exposure of each row's frame to the row's command \[s\], by the stamps; NaN for a row without a frame,
     /// empty if it is not known.
     pub frame_age_s: Vec<f64>,
-    /// Rows whose command did not act from the row on, as in a stall of the machine: what moved the bead then is not known. Empty: none.
+    /// Rows in a stall of the machine: when their command acted, and so what moved the bead, is not known. Empty: none.
     pub late_command: Vec<bool>,
     /// Exposure of every frame about its middle, if it is known \[s\]; else 0.
     pub exposure_s: f64,

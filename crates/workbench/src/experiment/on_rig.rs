@@ -65,7 +65,7 @@ pub struct Acquired {
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,
-    /// Rows whose command was not handed over with the row.
+    /// Rows whose command came to the board at a time that is not known.
     pub late_command: Vec<bool>,
     /// Places in the plan of the segments in which the bead left the view.
     pub out_of_view: Vec<usize>,
@@ -357,7 +357,7 @@ impl OnRig {
             age_s: rows.age_s(),
             fix_noise_um: fix_noise_um(ticks),
             frame_age_s: rows.frame_age_s(),
-            late_command: rows.late,
+            late_command: rows.stalled,
             rows: (rows.input, rows.output),
             unseen: rows.unseen,
             out_of_view,
