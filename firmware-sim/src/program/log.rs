@@ -150,6 +150,13 @@ impl Log {
     }
 }
 
+/// What a program that ends early has noted is written, too.
+impl Drop for Log {
+    fn drop(&mut self) {
+        let _ = self.finish();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
