@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Sender, channel};
 use std::thread::JoinHandle;
 
-/// A row each 0.97 ms and at each change of the board's state: rows fall anywhere in the period of a loop of 1 kHz, so that they tell when
-/// its commands act.
+/// A row comes each 0.97 ms and at each change of the board's state. So rows fall anywhere in the period of a loop of 1 kHz, and tell when its
+/// commands act.
 const PERIOD_NS: i64 = 970_000;
 const FLUSH_NS: i64 = 1_000_000_000;
 
@@ -150,7 +150,7 @@ impl Log {
     }
 }
 
-/// What a program that ends early has noted is written, too.
+/// A program that ends early loses no row.
 impl Drop for Log {
     fn drop(&mut self) {
         let _ = self.finish();

@@ -26,7 +26,7 @@ pub struct Record {
     /// From the middle of the exposure of each row's frame to the row's command \[s\], by the stamps; NaN for a row without a frame,
     /// empty if it is not known.
     pub frame_age_s: Vec<f64>,
-    /// Rows in a stall of the machine: when their command acted, and so what moved the bead, is not known. Empty: none.
+    /// Rows in a stall of the machine: when their command acted, and so how it moved the bead, is not known.
     pub late_command: Vec<bool>,
     /// Exposure of every frame about its middle, if it is known \[s\]; else 0.
     pub exposure_s: f64,
@@ -134,7 +134,7 @@ impl Record {
             resolution_um,
             unseen: vec![false; rows],
             frame_age_s: Vec::new(),
-            late_command: Vec::new(),
+            late_command: vec![false; rows],
             exposure_s: 0.0,
         })
     }
@@ -265,7 +265,7 @@ impl Record {
             resolution_um: self.resolution_um,
             unseen: self.unseen[from..to].to_vec(),
             frame_age_s: (self.frame_age_s.get(from..to)).map_or_else(Vec::new, <[f64]>::to_vec),
-            late_command: (self.late_command.get(from..to)).map_or_else(Vec::new, <[bool]>::to_vec),
+            late_command: self.late_command[from..to].to_vec(),
             exposure_s: self.exposure_s,
         }
     }
@@ -373,11 +373,7 @@ pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
                     j.frame_age_s.extend_from_slice(&r.frame_age_s);
                     j.frame_age_s.resize(j.rows() + r.rows(), f64::NAN);
                 }
-                if !j.late_command.is_empty() || !r.late_command.is_empty() {
-                    j.late_command.resize(j.rows(), false);
-                    j.late_command.extend_from_slice(&r.late_command);
-                    j.late_command.resize(j.rows() + r.rows(), false);
-                }
+                j.late_command.extend_from_slice(&r.late_command);
                 j.pzt_um.extend_from_slice(&r.pzt_um);
                 j.bead_um.extend_from_slice(&r.bead_um);
                 j.filled.extend_from_slice(&r.filled);

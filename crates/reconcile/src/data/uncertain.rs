@@ -52,14 +52,10 @@ fn add_late(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
         0.0
     };
     let shows = 2 + age_rows.max(0.0).ceil() as usize;
-    let late = (r.late_command.iter().enumerate()).filter(|(_, late)| **late);
-    let mut next = 0;
-    for (row, _) in late {
-        let until = (row + 1 + shows).min(extra.len());
-        for extra in &mut extra[next.max(row + 1).min(until)..until] {
+    for (row, extra) in extra.iter_mut().enumerate() {
+        if r.late_command[row.saturating_sub(shows)..row].contains(&true) {
             *extra += gain_per_sample * gain_per_sample * spread_um2;
         }
-        next = until;
     }
 }
 

@@ -76,8 +76,7 @@ impl Scheduler<'_> {
                 self.operator.ask(*request);
             }
         }
-        let board_stalls = self.faults.peers.board_thread_stalls_ns;
-        if let Some([from_ns, to_ns]) = board_stalls
+        if let Some([from_ns, to_ns]) = self.faults.peers.board_thread_stalls_ns
             && who == 2
             && (self.start_ns + from_ns..self.start_ns + to_ns).contains(&due_ns)
         {

@@ -43,7 +43,7 @@ fn a_line_that_stalls_for_less_than_200_ms_ends_no_run_and_one_that_stays_silent
 
 #[test]
 fn a_board_thread_that_stalls_is_treated_as_a_line_that_does() {
-    // The ring for commands holds 64 of them.
+    // The ring holds 64 commands.
     for (stall_ms, reason) in [
         (50, None),
         (100, None),

@@ -167,7 +167,7 @@ pub const FRAME_AGE: &str = "frame_age_s";
 /// Column of a record with the exposure of its frames.
 pub const EXPOSURE: &str = "exposure_s";
 
-/// Column of a record with 1 where it is not known when a row's command acted, as in a stall, else 0.
+/// Column of a record: 1 in a stall, in which nobody knows when a row's command acted, else 0.
 pub const LATE_COMMAND: &str = "late_command";
 /// Column of a record with 1 where a row's frame came, with a bead or without, and 0 where it was dropped.
 pub const FRAME_CAME: &str = "frame_came";

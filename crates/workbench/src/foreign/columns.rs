@@ -112,8 +112,10 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
     if wanted.held {
         hold_over_gaps(&mut record);
         record.frame_age_s = in_rows(&record, &t, &age);
-        record.late_command =
-            (in_rows(&record, &t, &late).iter().map(|late| *late == 1.0)).collect();
+        let late = in_rows(&record, &t, &late);
+        if !late.is_empty() {
+            record.late_command = late.iter().map(|late| *late == 1.0).collect();
+        }
         let came = in_rows(&record, &t, &came);
         if !came.is_empty() {
             record.unseen = (came.iter().zip(&record.bead_um))
