@@ -16,6 +16,8 @@ pub struct Latency {
 /// Quantiles of a [`Latency`] in microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Default)]
 pub struct Quantiles {
+    /// One in ten is shorter, us.
+    pub p10: f64,
     /// Median, us.
     pub p50: f64,
     /// 99th percentile, us.
@@ -72,6 +74,7 @@ impl Latency {
         // A histogram answers with its bucket's upper edge, which may lie above the exact maximum.
         let at = |q| self.histogram.value_at_quantile(q).min(self.max_ns) as f64 / 1e3;
         Quantiles {
+            p10: at(0.1),
             p50: at(0.5),
             p99: at(0.99),
             p999: at(0.999),
@@ -93,6 +96,7 @@ mod tests {
         }
         latency.record(12_345_678_901, 77);
         let q = latency.quantiles_us();
+        assert!((q.p10 - 1000.0).abs() < 2.0, "{q:?}");
         assert!((q.p50 - 5000.0).abs() < 5.0, "{q:?}");
         assert!((q.p99 - 9900.0).abs() < 11.0, "{q:?}");
         assert_eq!((q.max, q.max_tick), (12_345_678.901, 77));

@@ -65,7 +65,7 @@ impl Clues {
         const RECENT_NS: i64 = 1_000_000_000;
         let of_times = matches!(
             reason,
-            Some(SafeReason::StaleFrames | SafeReason::VisionSlow)
+            Some(SafeReason::StaleFrames | SafeReason::VisionSlow | SafeReason::LinkLost)
         );
         let skipped = (self.skipped_ns.zip(self.safe_ns))
             .is_some_and(|(skipped, safe)| safe - skipped < RECENT_NS);

@@ -4,6 +4,7 @@ use crate::Failure;
 use crate::ended::Ended;
 pub use crate::failure::describe;
 pub use crate::fit::{prepare, stated_exposure_s};
+use crate::frames_seen::FrameAge;
 use crate::provenance;
 use crate::rig::{Finished, Rig};
 use crate::rig_file::{ActuatorConfig, CameraConfig, ClockKind, RigFile};
@@ -343,8 +344,11 @@ pub fn delay_warning(file: &RigFile, summary: &Summary) -> Option<String> {
     if summary.exposure_to_command_us.max <= 0.0 || summary.counts.ticks < FEWEST_TICKS {
         return None;
     }
-    let found_ms = summary.loop_delay_ms - 0.5e-3 * file.timing.period_us;
-    crate::setup::camera_delay_advice(found_ms, &file.timing)
+    let age = FrameAge {
+        early_ms: 1e-3 * summary.exposure_to_command_us.p10,
+        median_ms: 1e-3 * summary.exposure_to_command_us.p50,
+    };
+    age.advice(&file.timing).map(|(what, _)| what)
 }
 
 /// Warnings about a run that is over.

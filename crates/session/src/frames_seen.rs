@@ -1,7 +1,9 @@
 //! Rate and age of a camera's frames, before anything is armed.
 
 use crate::failure::Failure;
+use crate::setup::camera_delay_advice;
 use cellpos_rig::{Clock, PositionSource};
+use cellpos_runtime::Timing;
 use cellpos_runtime::realtime::{self, Request};
 use serde::Serialize;
 
@@ -32,6 +34,38 @@ impl FrameAge {
             early_ms: at(10)?,
             median_ms: at(2)?,
         })
+    }
+
+    /// What the age says against the file, and the remedy. A machine that stalls makes frames older: if that alone is worth saying, no
+    /// value is advised, and a file that may be right is not blamed.
+    pub fn advice(self, timing: &Timing) -> Option<(String, &'static str)> {
+        let Self {
+            early_ms,
+            median_ms,
+        } = self;
+        let camera_delay_ms = timing.camera_delay_ms;
+        let advice = camera_delay_advice(median_ms, timing)?;
+        let undisturbed = Timing {
+            camera_delay_ms: early_ms,
+            ..*timing
+        };
+        if camera_delay_advice(median_ms, &undisturbed).is_none() {
+            return Some((
+                advice,
+                "design the controller again, too: cellpos design --rig",
+            ));
+        }
+        let between = (early_ms..=median_ms).contains(&camera_delay_ms);
+        if between || camera_delay_advice(early_ms, timing).is_none() {
+            return None;
+        }
+        Some((
+            format!(
+                "frames are {median_ms:.2} ms old when they are used (median), one in ten less than {early_ms:.2} ms: the machine is too busy \
+                 to measure it, but camera_delay_ms = {camera_delay_ms} is wrong"
+            ),
+            "end other programs and check again: cellpos doctor --why names what is late",
+        ))
     }
 }
 
@@ -133,6 +167,34 @@ mod tests {
                 latency_ms: 0.0,
                 field_um: [-10.0, 10.0],
             }
+        }
+    }
+
+    #[test]
+    fn the_lateness_of_a_busy_machine_is_not_advised_as_the_delay_of_the_camera() {
+        let said = |early_ms: f64, median_ms: f64, camera_delay_ms: f64| {
+            let timing = Timing {
+                camera_delay_ms,
+                ..Timing::default()
+            };
+            let age = FrameAge {
+                early_ms,
+                median_ms,
+            };
+            age.advice(&timing).map(|(what, _)| what)
+        };
+        // An idle machine: the file is right, or the value is said.
+        assert_eq!(said(3.18, 3.24, 3.2), None);
+        assert!(said(3.18, 3.24, 2.0).is_some_and(|what| what.contains("= 3.24 and design")));
+        // Frames of 3.2 ms on a machine that adds 3 ms in the median.
+        assert_eq!(said(3.3, 6.3, 3.2), None);
+        assert_eq!(said(3.3, 6.3, 5.0), None);
+        for camera_delay_ms in [2.0, 7.0] {
+            let what = said(3.3, 6.3, camera_delay_ms).expect("a word");
+            assert!(
+                what.contains("too busy") && !what.contains("write"),
+                "{what}"
+            );
         }
     }
 

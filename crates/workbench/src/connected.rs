@@ -5,10 +5,8 @@ use crate::finding::{Finding, Found, Weight};
 use crate::line_test::{self, LineTest, Quantiles};
 use cellpos_drivers::Axis;
 use cellpos_rig::{Camera, Clock, FrameBuffer};
-use cellpos_runtime::Timing;
 use cellpos_runtime::realtime::Request;
 use cellpos_session::rig_file::{ActuatorConfig, CameraConfig};
-use cellpos_session::setup::camera_delay_advice;
 use cellpos_session::{Failure, FrameAge, FramesSeen, RigFile};
 use serde::Serialize;
 use std::path::Path;
@@ -235,7 +233,7 @@ fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
             },
         );
     }
-    if let Some((advice, remedy)) = seen.age.and_then(|age| of_age(age, &file.timing)) {
+    if let Some((advice, remedy)) = seen.age.and_then(|age| age.advice(&file.timing)) {
         found.say(
             Weight::Warning,
             ("timing", "camera_delay_ms"),
@@ -244,38 +242,6 @@ fn judge_frames(found: &mut Found, file: &RigFile, seen: &FramesSeen) {
             remedy,
         );
     }
-}
-
-/// What the age of the frames says against the file, and the remedy. A machine that stalls makes frames older: if that alone is worth
-/// saying, no value is advised, and a file that may be right is not blamed.
-fn of_age(age: FrameAge, timing: &Timing) -> Option<(String, &'static str)> {
-    let FrameAge {
-        early_ms,
-        median_ms,
-    } = age;
-    let camera_delay_ms = timing.camera_delay_ms;
-    let advice = camera_delay_advice(median_ms, timing)?;
-    let undisturbed = Timing {
-        camera_delay_ms: early_ms,
-        ..*timing
-    };
-    if camera_delay_advice(median_ms, &undisturbed).is_none() {
-        return Some((
-            advice,
-            "design the controller again, too: cellpos design --rig",
-        ));
-    }
-    let between = (early_ms..=median_ms).contains(&camera_delay_ms);
-    if between || camera_delay_advice(early_ms, timing).is_none() {
-        return None;
-    }
-    Some((
-        format!(
-            "frames are {median_ms:.2} ms old when they are used (median), one in ten less than {early_ms:.2} ms: the machine is too busy \
-             to measure it, but camera_delay_ms = {camera_delay_ms} is wrong"
-        ),
-        "end other programs and check again: cellpos doctor --why names what is late",
-    ))
 }
 
 /// Rate and age of the frames against the loop's set-up; the calibration's origin against their size.
@@ -401,34 +367,6 @@ mod tests {
             ("calibration.origin_px", Some(9)),
         ];
         assert_eq!(places, expected);
-    }
-
-    #[test]
-    fn the_lateness_of_a_busy_machine_is_not_advised_as_the_delay_of_the_camera() {
-        let said = |early_ms: f64, median_ms: f64, camera_delay_ms: f64| {
-            let timing = Timing {
-                camera_delay_ms,
-                ..Timing::default()
-            };
-            let age = FrameAge {
-                early_ms,
-                median_ms,
-            };
-            of_age(age, &timing).map(|(what, _)| what)
-        };
-        // An idle machine: the file is right, or the value is said.
-        assert_eq!(said(3.18, 3.24, 3.2), None);
-        assert!(said(3.18, 3.24, 2.0).is_some_and(|what| what.contains("= 3.24 and design")));
-        // Frames of 3.2 ms on a machine that adds 3 ms in the median.
-        assert_eq!(said(3.3, 6.3, 3.2), None);
-        assert_eq!(said(3.3, 6.3, 5.0), None);
-        for camera_delay_ms in [2.0, 7.0] {
-            let what = said(3.3, 6.3, camera_delay_ms).expect("a word");
-            assert!(
-                what.contains("too busy") && !what.contains("write"),
-                "{what}"
-            );
-        }
     }
 
     #[test]

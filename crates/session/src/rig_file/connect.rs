@@ -169,18 +169,25 @@ impl RigFile {
         })
     }
 
-    /// Lowest and highest position that the picture shows, um. A real camera is opened for this and closed again.
+    /// Lowest and highest position at which the picture shows a bead whole, um. A real camera is opened for this and closed again.
     ///
     /// # Errors
     /// There is no calibration, or the camera cannot be opened.
-    pub fn field_um(&self) -> Result<[f64; 2], Failure> {
+    pub fn whole_bead_um(&self) -> Result<[f64; 2], Failure> {
         if let CameraConfig::Emulated {} = self.camera {
             let half_um = self.emulator.half_frame_um();
             return Ok([-half_um, half_um]);
         }
         let calibration = self.real_calibration()?;
         let info = self.open_camera()?.info();
-        Ok(calibration.field_um(info.width_px, info.height_px))
+        let [low_um, high_um] = calibration.field_um(info.width_px, info.height_px);
+        let template = self
+            .vision
+            .as_ref()
+            .and_then(|vision| vision.template().ok());
+        let radius_um =
+            template.map_or(0.0, |template| calibration.pixel_um * template.radius_px());
+        Ok([low_um + radius_um, high_um - radius_um])
     }
 
     /// The camera of a real rig, running.

@@ -130,6 +130,7 @@ mod tests {
             seconds,
             wakeups: (seconds * 1e3) as u64,
             wake_us: Quantiles {
+                p10: 5.0,
                 p999: 50.0,
                 ..Quantiles::default()
             },

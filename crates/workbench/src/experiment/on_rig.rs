@@ -167,13 +167,13 @@ impl OnRig {
         }
     }
 
-    /// The bead's amplitude for an excitation, um: at most `wanted_um`, and half of the way to the nearer border of the picture. A plant of
-    /// twice the model's gain then still keeps the bead in the picture; one of more is measured more gently after a second failure.
+    /// The bead's amplitude for an excitation, um: at most `wanted_um`, and half of the way to where the nearer border cuts its image.
+    /// A plant of twice the model's gain then still keeps the bead in the picture; one of more is measured more gently after a second failure.
     ///
     /// # Errors
-    /// Those of [`RigFile::field_um`].
+    /// Those of [`RigFile::whole_bead_um`].
     pub fn bead_amplitude_um(&self, wanted_um: f64) -> Result<f64, Failure> {
-        let [low_um, high_um] = self.file.field_um()?;
+        let [low_um, high_um] = self.file.whole_bead_um()?;
         let half_um = 0.5 * high_um.min(-low_um);
         // A target outside the picture has an error of its own, when the bead is to be held there.
         Ok(if half_um > 0.0 {
