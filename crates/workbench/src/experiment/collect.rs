@@ -1,9 +1,10 @@
 //! `cellpos reconcile --collect`: runs the deciding experiment on the rig, through the loop of `cellpos track`, adds its record to the
 //! data and reconciles again.
 
+use crate::experiment::again::Again;
 use crate::experiment::excitation::Experiment;
 use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
-use cellpos_ident::experiment::Turn;
+use cellpos_ident::experiment::Plan;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_session::Failure;
@@ -38,6 +39,27 @@ pub struct Collected {
     pub verdict: String,
 }
 
+impl Collected {
+    /// Of the records of an experiment.
+    pub fn of(
+        experiment: Experiment,
+        why: &str,
+        verdict: &str,
+        records: &[(PathBuf, Record)],
+    ) -> Vec<Self> {
+        let one = |(file, record): &(PathBuf, Record)| Self {
+            experiment: experiment.name(),
+            what: experiment.what(),
+            why: why.to_owned(),
+            file: file.clone(),
+            rows: record.rows(),
+            rows_without_bead: record.rows() - record.frames(),
+            verdict: verdict.to_owned(),
+        };
+        records.iter().map(one).collect()
+    }
+}
+
 /// How to collect.
 pub struct Collecting<'a> {
     /// The rig.
@@ -52,22 +74,22 @@ pub struct Collecting<'a> {
     pub seed: u64,
 }
 
-/// A run on a rig, as a record.
+/// An experiment on a rig.
 #[derive(Debug, Clone)]
 pub struct Ran {
-    /// The record.
-    pub record: Record,
+    /// Its records, each with its file: one of each run. There are several if the bead was lost and another one came.
+    pub records: Vec<(PathBuf, Record)>,
     /// Displacement at which the bead rests, um: for a held bead the mean command.
     pub neutral_um: f64,
     /// From the middle of an exposure to the tick that used it, s.
     pub age_s: f64,
 }
 
-/// Runs one experiment, all its times multiplied by `share`. Its record so far is written to `file` after each part, so that it
-/// survives the process.
+/// Runs one experiment, all its times multiplied by `share`. After a lost bead it runs again what is missing, as `identify` does. A
+/// record so far is written after each part, so that it survives the process: the first to `file`, the others beside it.
 ///
 /// # Errors
-/// The rig failed, or the run ended early; its record is in `file`.
+/// The rig failed, or a run ended early and a person must act; the records are in their files.
 pub fn run_experiment(
     rig: &OnRig,
     experiment: Experiment,
@@ -77,71 +99,117 @@ pub fn run_experiment(
     progress: &mut (dyn FnMut(&str) + Send),
 ) -> Result<Ran, Failure> {
     let plan = experiment.plan(rig, share, seed)?;
-    let all: Vec<Turn> = (0..plan.segments.len()).map(Turn::planned).collect();
-    let total = plan.ticks();
-    let exposure_s = stated_exposure_s(&rig.file).unwrap_or(0.0);
-    let name = file
-        .file_stem()
-        .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-    let mut heard = |ticks: usize| {
+    run_plan(rig, &plan, file, &mut |part| {
         progress(&format!(
             "on the rig: {}, {:.0} %",
             experiment.what(),
-            100.0 * ticks.min(total) as f64 / total.max(1) as f64
+            100.0 * part
         ));
-    };
-    let mut segment = |so_far: &Acquired| {
-        let kept =
-            record(&name, so_far, plan.period_s, exposure_s).and_then(|r| write_record(&r, file));
-        if let Err(failure) = kept {
-            tracing::warn!("{}: {}", file.display(), failure.text());
+    })
+}
+
+/// Runs a plan until all of it is measured; `progress` gets the part that is.
+fn run_plan(
+    rig: &OnRig,
+    plan: &Plan,
+    file: &Path,
+    progress: &mut (dyn FnMut(f64) + Send),
+) -> Result<Ran, Failure> {
+    let exposure_s = stated_exposure_s(&rig.file).unwrap_or(0.0);
+    let mut rig = rig.clone();
+    let (mut again, mut segments) = (Again::of(plan), Vec::new());
+    let mut records: Vec<(PathBuf, Record)> = Vec::new();
+    let total = plan.ticks().max(1) as f64;
+    let mut done = 0.0;
+    loop {
+        let todo = again.missing(&segments);
+        let file = free_path(file);
+        let keep = |so_far: &Acquired| {
+            let record = record(so_far, &file, plan.period_s, exposure_s)?;
+            write_record(&record, &file).map(|()| record)
+        };
+        let mut heard = |ticks: usize| progress((done + ticks as f64 / total).min(1.0));
+        let mut segment = |so_far: &Acquired| {
+            if let Err(failure) = keep(so_far) {
+                tracing::warn!("{}: {}", file.display(), failure.text());
+            }
+        };
+        let mut listener = Listener {
+            progress: &mut heard,
+            segment: &mut segment,
+        };
+        let acquired = rig.acquire(plan, &todo, &mut listener)?;
+        match keep(&acquired) {
+            Ok(record) => records.push((file, record)),
+            Err(failure) if acquired.trouble.is_none() => return Err(failure),
+            Err(failure) => tracing::warn!("{}: {}", file.display(), failure.text()),
         }
-    };
-    let mut listener = Listener {
-        progress: &mut heard,
-        segment: &mut segment,
-    };
-    let acquired = rig.acquire(&plan, &all, &mut listener)?;
-    if let Some(Trouble::Ended(ended)) = &acquired.trouble {
-        let kept = record(&name, &acquired, plan.period_s, exposure_s)
-            .and_then(|r| write_record(&r, file));
-        return Err(ended.failure(&match kept {
-            Ok(()) => format!(
-                "the records are in {}: give them to --data, or run the command again",
-                file.display()
-            ),
-            Err(_) => "run the command again; records already collected are kept".to_string(),
-        }));
+        segments.extend_from_slice(&acquired.records);
+        again.learn(&acquired, &segments);
+        done = segments.len() as f64 / plan.segments.len() as f64;
+        if !acquired.records.is_empty() {
+            rig.file.rested_um = Some(acquired.neutral_um);
+        }
+        match &acquired.trouble {
+            Some(trouble @ Trouble::Ended(ended)) => {
+                if !again.may_go_on(trouble) {
+                    return Err(ended.failure(&what_is_kept(&records)));
+                }
+                tracing::warn!("{}; measuring again what is missing", trouble.seen());
+            }
+            // A record is of use although the bead was out of sight in some of its segments.
+            Some(Trouble::Spoilt { .. }) | None => return ran(&rig, records, acquired.age_s),
+        }
     }
-    let record = record(&name, &acquired, plan.period_s, exposure_s)?;
-    write_record(&record, file)?;
-    let missing = record.rows() - record.frames();
-    if 50 * missing > record.rows() {
+}
+
+/// What to do after a run that ended early.
+fn what_is_kept(records: &[(PathBuf, Record)]) -> String {
+    let files: Vec<String> = (records.iter())
+        .map(|(file, _)| file.display().to_string())
+        .collect();
+    if files.is_empty() {
+        return "run the command again; records already collected are kept".to_owned();
+    }
+    format!(
+        "the records are in {}: give them to --data, or run the command again",
+        files.join(", ")
+    )
+}
+
+/// The records of an experiment, with a word if the machine did not keep the loop's time.
+fn ran(rig: &OnRig, records: Vec<(PathBuf, Record)>, age_s: Option<f64>) -> Result<Ran, Failure> {
+    let count = |of: fn(&Record) -> usize| records.iter().map(|(_, r)| of(r)).sum::<usize>();
+    let rows = count(Record::rows);
+    let missing = rows - count(Record::frames);
+    if 50 * missing > rows {
         tracing::warn!(
-            "{missing} of {} rows have no bead, or their frame came too late: this machine did not keep the loop's time, or the bead \
-             was hard to see, and the verdict may suffer from it (cellpos doctor)",
-            record.rows()
+            "{missing} of {rows} rows have no bead, or their frame came too late: this machine did not keep the loop's time, or the bead \
+             was hard to see, and the verdict may suffer from it (cellpos doctor)"
         );
     }
+    let longest = records.iter().max_by_key(|(_, record)| record.rows());
+    let (_, longest) = longest.ok_or_else(|| refused(ReconcileError::NoRecords))?;
     Ok(Ran {
-        neutral_um: neutral_um(&record, rig.model.plant.velocity_gain_at(Hertz(2.0))),
-        record,
-        age_s: acquired
-            .age_s
-            .unwrap_or(rig.file.timing.camera_delay_ms * 1e-3),
+        neutral_um: neutral_um(longest, rig.model.plant.velocity_gain_at(Hertz(2.0))),
+        records,
+        age_s: age_s.unwrap_or(rig.file.timing.camera_delay_ms * 1e-3),
     })
 }
 
 /// A run as a record.
 fn record(
-    name: &str,
     acquired: &Acquired,
+    file: &Path,
     period_s: f64,
     exposure_s: f64,
 ) -> Result<Record, Failure> {
+    let name = file
+        .file_stem()
+        .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
     let (pzt_um, bead_um) = &acquired.rows;
     let time_s: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * period_s).collect();
-    let mut record = Record::from_rows(name, &time_s, pzt_um, bead_um).map_err(refused)?;
+    let mut record = Record::from_rows(&name, &time_s, pzt_um, bead_um).map_err(refused)?;
     record.unseen.clone_from(&acquired.unseen);
     record.frame_age_s.clone_from(&acquired.frame_age_s);
     record.late_command.clone_from(&acquired.late_command);
@@ -242,14 +310,15 @@ pub fn look(
     let mut done: Vec<Experiment> = Vec::new();
     loop {
         let result = reconcile(model, records, &options, &mut |text| progress(text));
-        if let Some(last) = collected.last_mut() {
-            last.verdict = match &result {
-                Ok(r) => r.verdict.word().to_owned(),
-                Err(error) => error.to_string(),
-            };
+        let verdict = match &result {
+            Ok(r) => r.verdict.word().to_owned(),
+            Err(error) => error.to_string(),
+        };
+        for new in collected.iter_mut().filter(|one| one.verdict.is_empty()) {
+            new.verdict.clone_from(&verdict);
         }
         let wanted = next(&result)
-            .filter(|_| collected.len() < collecting.rounds)
+            .filter(|_| done.len() < collecting.rounds)
             // The same experiment would not decide now either; a longer record may.
             .map(|(e, why)| {
                 if done.contains(&e) {
@@ -263,11 +332,15 @@ pub fn look(
             return Ok((result.map_err(refused)?, collected));
         };
         done.push(experiment);
-        let seed = collecting.seed + collected.len() as u64;
+        let seed = collecting.seed + done.len() as u64 - 1;
         std::fs::create_dir_all(collecting.folder).map_err(Failure::failed)?;
-        let file = free_name(collecting.folder, experiment);
+        let file = collecting
+            .folder
+            .join(format!("{}-1.csv", experiment.name()));
         let Ran {
-            record, neutral_um, ..
+            records: ran,
+            neutral_um,
+            ..
         } = run_experiment(
             collecting.rig,
             experiment,
@@ -280,25 +353,24 @@ pub fn look(
         if records.is_empty() {
             model.working_point_um = neutral_um;
         }
-        collected.push(Collected {
-            experiment: experiment.name(),
-            what: experiment.what(),
-            why,
-            file,
-            rows: record.rows(),
-            rows_without_bead: record.rows() - record.frames(),
-            verdict: String::new(),
-        });
-        records.push(record);
+        collected.extend(Collected::of(experiment, &why, "", &ran));
+        records.extend(ran.into_iter().map(|(_, record)| record));
     }
 }
 
-/// The path of a new file, so that nothing is overwritten.
-fn free_name(folder: &Path, experiment: Experiment) -> PathBuf {
-    (1..)
-        .map(|n| folder.join(format!("{}-{n}.csv", experiment.name())))
+/// The path itself if there is no such file yet, else one with the next free number: `survey-1.csv`, then `survey-2.csv`. Nothing is
+/// overwritten.
+fn free_path(file: &Path) -> PathBuf {
+    let stem = file
+        .file_stem()
+        .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
+    let stem = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    let stem = stem.trim_end_matches('-');
+    let numbered = (1..).map(|n| file.with_file_name(format!("{stem}-{n}.csv")));
+    std::iter::once(file.to_owned())
+        .chain(numbered)
         .find(|path| !path.exists())
-        .unwrap_or_else(|| folder.join(experiment.name()))
+        .unwrap_or_else(|| file.to_owned())
 }
 
 #[cfg(test)]

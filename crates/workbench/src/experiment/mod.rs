@@ -21,6 +21,7 @@
 //! # Ok(())
 //! # }
 //! ```
+mod again;
 mod camera_rate;
 pub mod circle;
 pub mod collect;

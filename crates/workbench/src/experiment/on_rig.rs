@@ -93,6 +93,16 @@ pub enum Trouble {
     },
 }
 
+impl Trouble {
+    /// What was seen, without the remedy.
+    pub fn seen(&self) -> String {
+        match self {
+            Self::Ended(ended) => ended.seen.clone(),
+            Self::Spoilt { .. } => self.to_string(),
+        }
+    }
+}
+
 impl std::fmt::Display for Trouble {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {

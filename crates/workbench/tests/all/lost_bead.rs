@@ -6,6 +6,8 @@ use cellpos_ident::experiment::{Plan, PlannedSegment, Turn};
 use cellpos_plant::Model;
 use cellpos_session::RigFile;
 use cellpos_session::rig_file::Frames;
+use cellpos_workbench::experiment::collect::run_experiment;
+use cellpos_workbench::experiment::excitation::Experiment;
 use cellpos_workbench::experiment::on_rig::{Listener, OnRig, Trouble};
 
 /// Ticks at rest before the first segment.
@@ -88,4 +90,30 @@ fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it
     assert!(rest_um < 0.1, "{rest_um} um of command at the end");
     let held_um = rms(bead_um[end - 200..].iter().copied());
     assert!(held_um < 0.2, "{held_um} um at the end");
+}
+
+#[test]
+fn an_experiment_goes_on_with_the_next_bead_and_keeps_a_record_of_each() {
+    let mut file = RigFile::default();
+    // Each run begins the emulated time anew, and loses its bead for longer than the loop waits.
+    file.emulator.faults.event.push(FaultEvent {
+        kind: FaultKind::LoseBead,
+        at_s: 8.0,
+        for_s: Some(9.0),
+    });
+    let rig = OnRig::new(file, Model::eq6(), None, Frames::Off, true).expect("an emulated rig");
+    let folder = tempfile::tempdir().expect("a folder");
+    let first = folder.path().join("amplitudes-1.csv");
+    let ran = run_experiment(&rig, Experiment::Amplitudes, 0.25, 1, &first, &mut |_| {});
+    let ran = ran.unwrap_or_else(|failure| panic!("{}", failure.text()));
+    let names: Vec<_> = (ran.records.iter())
+        .map(|(file, _)| file.file_name().expect("a name").to_string_lossy())
+        .collect();
+    assert!(names.len() > 1, "{names:?}");
+    for (n, name) in names.iter().enumerate() {
+        assert_eq!(name.as_ref(), format!("amplitudes-{}.csv", n + 1));
+    }
+    for (file, record) in &ran.records {
+        assert!(file.is_file() && record.frames() > 1000, "{record:?}");
+    }
 }

@@ -14,11 +14,11 @@ use crate::experiment::identify::{self, Done, Excitation};
 use crate::experiment::on_rig::OnRig;
 use cellpos_ident::excitation::PAPER_FREQUENCIES_HZ;
 use cellpos_plant::{Model, effects};
-use cellpos_reconcile::{Options, Reconciliation};
+use cellpos_reconcile::{Options, Reconciliation, Record};
 use cellpos_session::{Failure, connect};
 use stage::{Motion, Stage};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Settings of the circle.
 pub struct Job<'a> {
@@ -95,7 +95,7 @@ pub fn close(job: Job<'_>, progress: &mut (dyn FnMut(&str) + Send)) -> Result<Ci
     {
         start = start.with_effect(effects::exposure_averaging(exposure_s));
     }
-    let (reconciled, collected) = reconcile(&job, &mut start, &first, survey, progress)?;
+    let (reconciled, collected) = reconcile(&job, &mut start, &first, progress)?;
 
     // The truth as the loop sees it: the delay runs from the middle of an exposure to the tick that uses its frame.
     let truth = job.truth.clone().map(|model| Model {
@@ -174,10 +174,11 @@ fn reconcile(
     job: &Job<'_>,
     start: &mut Model,
     survey: &Ran,
-    file: PathBuf,
     progress: &mut (dyn FnMut(&str) + Send),
 ) -> Result<(Reconciliation, Vec<Collected>), Failure> {
-    let mut records = vec![survey.record.clone()];
+    let mut records: Vec<Record> = (survey.records.iter())
+        .map(|(_, record)| record.clone())
+        .collect();
     let options = Options {
         max_effects: job.max_effects,
         ..Options::default()
@@ -189,22 +190,14 @@ fn reconcile(
         share: job.effort,
         seed: job.rig.file.emulator.seed + 1,
     };
-    let (reconciled, mut collected) =
-        collect::look(start, &mut records, &options, &collecting, progress)?;
-    let verdict = match collected.is_empty() {
+    let (reconciled, more) = collect::look(start, &mut records, &options, &collecting, progress)?;
+    let verdict = match more.is_empty() {
         true => reconciled.verdict.word(),
         false => "ambiguous",
     };
-    let first = Collected {
-        experiment: Experiment::Survey.name(),
-        what: Experiment::Survey.what(),
-        why: "nothing is recorded yet".to_owned(),
-        file,
-        rows: survey.record.rows(),
-        rows_without_bead: survey.record.rows() - survey.record.frames(),
-        verdict: verdict.to_owned(),
-    };
-    collected.insert(0, first);
+    let why = "nothing is recorded yet";
+    let mut collected = Collected::of(Experiment::Survey, why, verdict, &survey.records);
+    collected.extend(more);
     Ok((reconciled, collected))
 }
 

@@ -6,16 +6,15 @@ pub mod page;
 mod partial;
 pub mod said;
 
+use crate::experiment::again::Again;
 use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
 use cellpos_ident::excitation::ExcitationLimits;
-use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, Turn, common_age_s};
+use cellpos_ident::experiment::{Cause, Measured, Plan, RecordedSegment, common_age_s};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::summary::{Identification, summarise};
 use cellpos_plant::Hertz;
-use cellpos_runtime::SafeReason;
-use cellpos_runtime::life::Refusal;
 use cellpos_session::view::Pages;
-use cellpos_session::{Ended, Failure, setup};
+use cellpos_session::{Failure, setup};
 use held_bead::{HeldBead, Setup};
 use led::DelayTest;
 use std::path::PathBuf;
@@ -228,7 +227,7 @@ fn led_delay(job: &Job, rig: &OnRig) -> Result<Option<DelayTest>, Failure> {
     })
 }
 
-/// Runs on the rig of a rig.toml until no segment is missing or four runs in a row have measured none. It runs again after a lost
+/// Runs on the rig of a rig.toml until no segment is missing or five runs in a row have measured none. It runs again after a lost
 /// bead or a stall of machine or line, but not if a person must act first.
 fn on_rig(
     job: &Job,
@@ -238,18 +237,15 @@ fn on_rig(
     progress: &mut (dyn FnMut(usize) + Send),
     mut pages: Option<&mut Pages>,
 ) -> Result<Raw, Failure> {
-    const IN_VAIN: usize = 5;
-    let mut in_vain = 0;
-    let mut spoilt = vec![0; plan.segments.len()];
+    let mut again = Again::of(plan);
     let mut warnings = Vec::new();
     let mut runs = Vec::new();
-    let mut had_bead = false;
     let mut rig = rig.clone();
     let mut age_s = rig.file.timing.camera_delay_ms * 1e-3;
     let mut fix_noise_um = None;
     let mut board = None;
     loop {
-        let todo = missing(plan, &records, &spoilt);
+        let todo = again.missing(&records);
         if todo.is_empty() {
             break;
         }
@@ -266,23 +262,16 @@ fn on_rig(
         };
         let acquired = rig.acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())?;
         records = joined(&records, &acquired.records);
-        in_vain = if acquired.records.is_empty() {
-            in_vain + 1
-        } else {
-            0
-        };
         if !acquired.records.is_empty() {
             // Where the zero flow has wandered meanwhile the flow is slow and a bead stays in view: the next run begins there.
             rig.file.rested_um = Some(acquired.neutral_um);
         }
         age_s = acquired.age_s.unwrap_or(age_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
-        board = Some(acquired.board);
+        board = Some(acquired.board.clone());
         runs.extend(acquired.run.clone());
-        had_bead |= !acquired.rows.0.is_empty();
-        let failed = missing(plan, &records, &spoilt);
-        let done = todo.iter().filter(|turn| turn.part < 1.0);
-        let done = done.filter(|turn| failed.iter().all(|f| f.index != turn.index));
+        let gentler = todo.iter().filter(|turn| turn.part < 1.0);
+        let done = gentler.filter(|turn| records.iter().any(|r| r.index == turn.index));
         warnings.extend(done.map(|turn| {
             format!(
                 "segment {} ({}) lost the bead twice as planned and is measured at {} of its amplitude",
@@ -291,19 +280,11 @@ fn on_rig(
                 turn.part
             )
         }));
-        // Of a run that a lost bead ended, the first missing segment lost it.
-        let lost = matches!(&acquired.trouble, Some(Trouble::Ended(ended)) if !ended.may_pass());
-        for (place, turn) in failed.iter().enumerate() {
-            let out_of_view = acquired.out_of_view.contains(&turn.index);
-            spoilt[turn.index] += u32::from(out_of_view || lost && place == 0);
-        }
+        again.learn(&acquired, &records);
         match acquired.trouble {
             None => {}
-            Some(trouble @ Trouble::Spoilt { .. }) if in_vain < IN_VAIN => {
-                tracing::warn!("{trouble}; measuring again what is missing");
-            }
-            Some(Trouble::Ended(ended)) if may_go_on(&ended, had_bead) && in_vain < IN_VAIN => {
-                tracing::warn!("{}; measuring again what is missing", ended.seen);
+            Some(trouble) if again.may_go_on(&trouble) => {
+                tracing::warn!("{}; measuring again what is missing", trouble.seen());
             }
             Some(trouble) => {
                 let (done, of) = (records.len(), plan.segments.len());
@@ -334,28 +315,6 @@ fn on_rig(
         warnings,
         runs,
     })
-}
-
-/// Whether another run may succeed without a person's action: a stall may be over, and after a lost bead another may come.
-fn may_go_on(ended: &Ended, had_bead: bool) -> bool {
-    let lost = ended.refusal.is_some_and(Refusal::lacks_a_bead)
-        || ended.reason == Some(SafeReason::BeadLost);
-    ended.may_pass() || had_bead && lost
-}
-
-/// Segments not measured yet, each with the times that the bead left the view in it, `spoilt`. After the first, which may be chance, it
-/// runs again as planned. After another one the rig moves the bead further than the model predicts: half the amplitude, then a quarter.
-/// What the machine spoilt runs again as it was.
-fn missing(plan: &Plan, records: &[RecordedSegment], spoilt: &[u32]) -> Vec<Turn> {
-    let is_missing = |index: &usize| records.iter().all(|r| r.index != *index);
-    let indices = (0..plan.segments.len()).filter(is_missing);
-    indices
-        .map(|index| {
-            let times = spoilt.get(index).copied().unwrap_or(0);
-            let part = [1.0, 1.0, 0.5].get(times as usize).copied().unwrap_or(0.25);
-            Turn { index, part }
-        })
-        .collect()
 }
 
 /// Segments of earlier runs and of this one, in order.
@@ -457,36 +416,4 @@ fn acquire(
         }
     }
     Ok(records)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use cellpos_plant::Complex;
-
-    #[test]
-    fn a_segment_that_fails_again_and_again_is_run_more_gently_and_one_that_failed_once_is_not() {
-        let limits = ExcitationLimits {
-            bead_um: 8.0,
-            bead_um_per_s: 400.0,
-            pzt_um: 10.0,
-            slew_um_per_s: 3200.0,
-        };
-        let integrator = |f: f64| {
-            let w = 2.0 * std::f64::consts::PI * f;
-            (Complex::new(0.0, -400.0 / w), Complex::new(0.0, 0.0))
-        };
-        let lines_hz = [5.0, 10.0, 20.0, 50.0, 100.0];
-        let plan = Plan::stepped_sines(&lines_hz, &integrator, limits, 1e-3, 10.0);
-        let measured = RecordedSegment {
-            index: 1,
-            from: 0,
-            age_s: None,
-            input: Vec::new(),
-            output: Vec::new(),
-        };
-        let turns = missing(&plan, &[measured], &[0, 3, 1, 2, 7]);
-        let turns: Vec<(usize, f64)> = turns.iter().map(|turn| (turn.index, turn.part)).collect();
-        assert_eq!(turns, [(0, 1.0), (2, 1.0), (3, 0.5), (4, 0.25)]);
-    }
 }
