@@ -2,10 +2,11 @@
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
-use std::io::Read as _;
+use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -42,9 +43,15 @@ fn until<T>(child: &mut Child, what: &str, mut there: impl FnMut() -> Option<T>)
         }
         if let Some(status) = child.try_wait().unwrap() {
             let mut said = String::new();
-            let mut pipes = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
-            pipes.0.read_to_string(&mut said).unwrap();
-            pipes.1.read_to_string(&mut said).unwrap();
+            child
+                .stdout
+                .take()
+                .unwrap()
+                .read_to_string(&mut said)
+                .unwrap();
+            if let Some(mut pipe) = child.stderr.take() {
+                pipe.read_to_string(&mut said).unwrap();
+            }
             panic!("{status} without a {what}:\n{said}");
         }
         assert!(start.elapsed() < PATIENCE, "no {what} in time");
@@ -302,6 +309,17 @@ fn prepared() -> tempfile::TempDir {
     folder
 }
 
+/// The lines that a pipe gives, as they come.
+fn lines(pipe: impl Read + Send + 'static) -> Receiver<String> {
+    let (sender, received) = channel();
+    std::thread::spawn(move || {
+        let lines = BufReader::new(pipe).lines().map_while(Result::ok);
+        // The receiver goes when the test has heard enough; the pipe is read on, so that the program is not held.
+        lines.for_each(|line| drop(sender.send(line)));
+    });
+    received
+}
+
 /// State of a process by its letter, as the system has it.
 fn state(process: Pid) -> Option<char> {
     let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
@@ -322,12 +340,12 @@ fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop()
         if sign.is_empty() {
             // Nothing is written until later; before the rig is held, Ctrl-Z stops the program as any other.
             let pid = Pid::from_child(&child);
+            let heard = lines(child.stderr.take().unwrap());
             until(&mut child, line, || {
                 kill_process(pid, Signal::TSTP).unwrap();
                 std::thread::sleep(Duration::from_millis(60));
-                let stopped = state(pid) == Some('T');
                 kill_process(pid, Signal::CONT).unwrap();
-                (!stopped).then_some(())
+                heard.try_iter().find(|text| text.contains("refused"))
             });
         } else {
             until(&mut child, line, || {

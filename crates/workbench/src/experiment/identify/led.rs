@@ -251,11 +251,12 @@ mod tests {
         let (switched_s, frames) = switch(&mut camera, |_| Ok(()), &edges_s, end_ns).unwrap();
         assert_eq!(switched_s.len(), edges_s.len());
         assert!(frames.mid_s.len() > 200, "{}", frames.mid_s.len());
-        // With the frames they would be late by half a period, in the median. A stall makes few edges late.
+        // With the frames a quarter of them would be late by less than a quarter of a period, as for any even spread. A busy machine makes
+        // edges late, none early.
         let late_s: Vec<f64> = (switched_s.iter().zip(&edges_s))
             .map(|(switched_s, edge_s)| switched_s - edge_s)
             .collect();
-        let median_s = cellpos_numeric::statistics::median(&late_s);
-        assert!(median_s < 0.25e-3, "{late_s:?}");
+        let [quarter_s] = cellpos_numeric::statistics::quantiles(&late_s, [0.25]);
+        assert!(quarter_s < 0.125e-3, "{late_s:?}");
     }
 }
