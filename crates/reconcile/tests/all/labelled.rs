@@ -88,6 +88,7 @@ fn hysteresis_of_the_piezo_is_named() {
 }
 
 #[test]
+#[cfg_attr(not(no_shared_data), ignore = "27 s of a debug build: for .ci/nightly")]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
 fn a_flow_drift_is_named_however_the_records_are_ordered_and_cut() {
     let first = expect("flow-drift", &["flow-drift"]);

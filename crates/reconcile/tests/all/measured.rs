@@ -244,6 +244,7 @@ fn silverbox() -> Set {
 }
 
 #[test]
+#[cfg_attr(not(no_shared_data), ignore = "23 s of a debug build: for .ci/nightly")]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn a_silverbox_has_a_stiffness_that_grows_with_the_position_and_no_name_in_the_catalogue() {
     let s = set(
