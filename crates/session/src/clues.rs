@@ -70,7 +70,9 @@ impl Clues {
         let skipped = (self.skipped_ns.zip(self.safe_ns))
             .is_some_and(|(skipped, safe)| safe - skipped < RECENT_NS);
         let policy = conditions.policy.as_str();
-        let ordinary = !matches!(policy, "SCHED_FIFO" | "virtual clock");
+        // A cable is pulled at any priority.
+        let ordinary = reason != Some(SafeReason::LinkLost)
+            && !matches!(policy, "SCHED_FIFO" | "virtual clock");
         let signs = [
             (skipped, "ticks were skipped just before"),
             (ordinary, "the loop had no real-time priority"),
@@ -82,5 +84,31 @@ impl Clues {
             let seen = seen.join(", and ");
             format!("this machine may have been busy ({seen}): run cellpos doctor and close other programs; if that changes nothing, ")
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_that_is_silent_after_skipped_ticks_may_be_the_machine_and_one_that_is_cut_is_not() {
+        let conditions = Conditions::default();
+        let said = |reason, skipped_ns| {
+            let clues = Clues {
+                skipped_ns,
+                safe_ns: Some(3_000_000_000),
+                ..Clues::default()
+            };
+            clues.machine(Some(reason), &conditions)
+        };
+        let busy = said(SafeReason::LinkLost, Some(2_500_000_000)).expect("a clue");
+        assert!(busy.contains("ticks were skipped"), "{busy}");
+        assert!(!busy.contains("priority"), "{busy}");
+        assert_eq!(said(SafeReason::LinkLost, Some(1_000_000_000)), None);
+        assert_eq!(said(SafeReason::LinkLost, None), None);
+        let late = said(SafeReason::StaleFrames, None).expect("a clue");
+        assert!(late.contains("no real-time priority"), "{late}");
+        assert_eq!(said(SafeReason::BeadLost, Some(2_500_000_000)), None);
     }
 }

@@ -12,8 +12,9 @@ pub const REST_TICKS: usize = 400;
 
 /// Holds the bead at 0 um and plays the excitation, counted from the tick in which the loop was closed.
 ///
-/// If the bead is frozen, the segment is invalid and its rest is not played. So a loop at rest catches the bead that is found
-/// again, and the next segment begins from there.
+/// If the bead is frozen for as long as a segment may lack positions ([`Plan::lost_frames`]), the segment is invalid and its rest is not
+/// played. So a loop at rest catches the bead that is found again, and the next segment begins from there. After a shorter freeze, as a
+/// machine that stalls causes, it plays on where the clock is.
 #[derive(Debug, Clone)]
 pub struct Exciting {
     excitation_um: Vec<f64>,
@@ -22,6 +23,9 @@ pub struct Exciting {
     /// Tick up to which nothing is played.
     quiet_until: usize,
     now: Option<usize>,
+    /// Tick in which the bead was frozen, and ticks after which its segment is given up.
+    frozen_at: Option<usize>,
+    patience: usize,
 }
 
 impl Exciting {
@@ -29,15 +33,17 @@ impl Exciting {
     pub fn new(plan: &Plan, todo: &[Turn]) -> Self {
         let schedule = plan.schedule(todo);
         let starts = schedule.spans.iter().map(|span| span.start).collect();
-        Self::playing(schedule.excitation_um, starts)
+        Self::playing(schedule.excitation_um, starts, plan.lost_frames)
     }
 
-    fn playing(excitation_um: Vec<f64>, starts: Vec<usize>) -> Self {
+    fn playing(excitation_um: Vec<f64>, starts: Vec<usize>, patience: usize) -> Self {
         Self {
             excitation_um,
             starts,
             quiet_until: 0,
             now: None,
+            frozen_at: None,
+            patience,
         }
     }
 
@@ -52,7 +58,11 @@ impl ReferenceGenerator for Exciting {
         preview_um.fill(0.0);
         let tick = usize::try_from(input.tick).unwrap_or(usize::MAX);
         self.now = input.running.then_some(tick);
-        if let (true, Some(at)) = (input.frozen, self.at()) {
+        let frozen_at = self.frozen_at.unwrap_or(tick);
+        self.frozen_at = input.frozen.then_some(frozen_at);
+        if let (true, Some(at)) = (input.frozen, self.at())
+            && tick - frozen_at >= self.patience
+        {
             let next = self.starts.iter().copied().find(|&start| start > at);
             self.quiet_until = next.unwrap_or(usize::MAX);
         }
@@ -82,9 +92,10 @@ impl ReferenceGenerator for Exciting {
 mod tests {
     use super::*;
 
-    /// Output of two segments of three ticks each, with the bead frozen in some ticks, and the tick of their end.
+    /// Output of two segments of three ticks each, with the bead frozen in some ticks, and the tick of their end. A freeze of two ticks is
+    /// too long for a segment.
     fn played(frozen: impl Fn(usize) -> bool) -> (Vec<f64>, usize) {
-        let mut exciting = Exciting::playing(vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], vec![0, 3]);
+        let mut exciting = Exciting::playing(vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], vec![0, 3], 1);
         let mut all = Vec::new();
         for tick in 0.. {
             let input = ReferenceInput {
@@ -121,8 +132,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_of_a_segment_in_which_the_bead_was_frozen_is_not_played() {
-        let (all, over) = played(|tick| tick == SETTLE_TICKS + 1);
+    fn what_is_left_of_a_segment_in_which_the_bead_was_frozen_for_long_is_not_played() {
+        let (all, over) = played(|tick| (SETTLE_TICKS..SETTLE_TICKS + 2).contains(&tick));
         assert_eq!(
             all[SETTLE_TICKS..SETTLE_TICKS + 6],
             [1.0, 0.0, 0.0, 4.0, 5.0, 6.0]
@@ -132,9 +143,15 @@ mod tests {
             SETTLE_TICKS + 6 + REST_TICKS,
             "the plan is the clock's"
         );
-        let (all, _) = played(|tick| tick == SETTLE_TICKS + 4);
+        let (all, _) = played(|tick| (SETTLE_TICKS + 3..SETTLE_TICKS + 5).contains(&tick));
         assert!(all[SETTLE_TICKS + 4..].iter().all(|um| *um == 0.0));
         let (all, _) = played(|tick| tick < SETTLE_TICKS);
         assert_eq!(all[SETTLE_TICKS], 1.0, "a freeze before it spoils nothing");
+        let (all, _) = played(|tick| tick == SETTLE_TICKS + 1);
+        assert_eq!(
+            all[SETTLE_TICKS..SETTLE_TICKS + 6],
+            [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+            "nor does a short one"
+        );
     }
 }

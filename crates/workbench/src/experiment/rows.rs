@@ -199,24 +199,31 @@ impl Rows {
             let bare = &self.without_bead[start + rows.start..start + rows.end];
             2 * bare.iter().filter(|bare| **bare).count() > bare.len()
         };
-        if let Some(at) = usable.iter().position(|usable| !usable) {
-            let shown = output[..at].iter().rposition(|um| um.is_finite());
-            let out_of_view = out_of_view(shown.map_or(0, |row| row + 1)..at);
-            return Err(Spoilt::Frozen { at, out_of_view });
-        }
+        // In a freeze the bead does not follow the excitation: a short one is a gap as any other.
+        let output: Vec<f64> = (output.iter().zip(usable))
+            .map(|(um, usable)| if *usable { *um } else { f64::NAN })
+            .collect();
         let mut gap = 0;
         for (row, um) in output.iter().enumerate() {
             gap = if um.is_finite() { 0 } else { gap + 1 };
             if gap >= lost_frames {
                 let at = row + 1 - gap;
-                return Err(Spoilt::Unseen {
-                    at,
-                    rows: gap,
-                    out_of_view: out_of_view(at..row + 1),
+                let out_of_view = out_of_view(at..row + 1);
+                let frozen = usable[at..=row].iter().position(|usable| !usable);
+                return Err(match frozen {
+                    Some(after) => Spoilt::Frozen {
+                        at: at + after,
+                        out_of_view,
+                    },
+                    None => Spoilt::Unseen {
+                        at,
+                        rows: gap,
+                        out_of_view,
+                    },
                 });
             }
         }
-        let (input, output) = (self.input[start..end].to_vec(), output.to_vec());
+        let input = self.input[start..end].to_vec();
         let steps = output[from - start..].windows(2);
         let shown = (steps.clone().zip(&self.late[from..]))
             .filter(|(pair, late)| !**late && pair.iter().all(|um| um.is_finite()))
