@@ -208,17 +208,17 @@ impl Rows {
             gap = if um.is_finite() { 0 } else { gap + 1 };
             if gap >= lost_frames {
                 let at = row + 1 - gap;
-                let out_of_view = out_of_view(at..row + 1);
                 let frozen = usable[at..=row].iter().position(|usable| !usable);
-                return Err(match frozen {
-                    Some(after) => Spoilt::Frozen {
-                        at: at + after,
-                        out_of_view,
+                return Err(match frozen.map(|after| at + after) {
+                    // What came before the freeze is its reason.
+                    Some(frozen) => Spoilt::Frozen {
+                        at: frozen,
+                        out_of_view: out_of_view(at..frozen),
                     },
                     None => Spoilt::Unseen {
                         at,
                         rows: gap,
-                        out_of_view,
+                        out_of_view: out_of_view(at..row + 1),
                     },
                 });
             }

@@ -286,7 +286,7 @@ fn a_stall_is_no_reason_to_move_the_bead_less_and_a_bead_out_of_view_is() {
         }
     }));
     let frozen = |ticks: &mut Vec<TickRecord>| {
-        for tick in &mut ticks[gone.end..gone.end + 20] {
+        for tick in &mut ticks[gone.end..gone.end + 60] {
             tick.flags.set(TickFlags::FREEZE);
         }
     };
@@ -313,4 +313,18 @@ fn a_stall_is_no_reason_to_move_the_bead_less_and_a_bead_out_of_view_is() {
         stalled(ticks);
         frozen(ticks);
     }));
+}
+
+#[test]
+fn a_short_freeze_is_a_gap_in_a_segment_and_a_long_one_spoils_it() {
+    for (rows, is_whole) in [(49, true), (50, false)] {
+        let mut ticks = ticks(10.0, 2000, &CALM);
+        for tick in &mut ticks[600..600 + rows] {
+            tick.flags.set(TickFlags::FREEZE);
+        }
+        let segment = Rows::of(&ticks, PERIOD_NS).segment(&SPAN, 50);
+        assert_eq!(segment.is_ok(), is_whole, "{segment:?}");
+        let missing = segment.map(|s| s.output.iter().filter(|um| um.is_nan()).count());
+        assert!(missing.is_ok_and(|missing| missing == rows) == is_whole);
+    }
 }
