@@ -90,6 +90,8 @@ pub enum Trouble {
         of: usize,
         /// The first one, and the reason.
         first: String,
+        /// The bead left the view in one of them. If in none, machine or line stalled, or an operator froze the bead.
+        out_of_view: bool,
     },
 }
 
@@ -107,7 +109,9 @@ impl std::fmt::Display for Trouble {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Ended(ended) => ended.fmt(f),
-            Self::Spoilt { missing, of, first } => {
+            Self::Spoilt {
+                missing, of, first, ..
+            } => {
                 write!(f, "{missing} of {of} segments were spoilt; {first}")
             }
         }
@@ -331,6 +335,7 @@ impl OnRig {
                 missing: of - done,
                 of,
                 first: self.first_spoilt(&ticks, plan, &schedule.spans),
+                out_of_view: !acquired.out_of_view.is_empty(),
             })
         } else {
             Some(Trouble::Ended(finished.ended))

@@ -352,10 +352,16 @@ fn stopped(
     };
     Ok(match why {
         Trouble::Ended(ended) => ended.failure(&go_on),
-        spoilt => Failure::Failed(miette::miette!(
-            help = format!("bring a bead into view and {go_on}"),
-            "{spoilt}"
-        )),
+        Trouble::Spoilt { out_of_view, .. } => {
+            let first = match out_of_view {
+                true => "bring a bead into view",
+                false => "end what holds up machine or line (cellpos doctor --why)",
+            };
+            Failure::Failed(miette::miette!(
+                help = format!("{first}, then {go_on}"),
+                "{why}"
+            ))
+        }
     })
 }
 
@@ -404,7 +410,12 @@ fn acquire(
                         let (done, of) = (records.len(), plan.segments.len());
                         let missing = of - done;
                         let first = error.to_string();
-                        let why = Trouble::Spoilt { missing, of, first };
+                        let why = Trouble::Spoilt {
+                            missing,
+                            of,
+                            first,
+                            out_of_view: true,
+                        };
                         return Err(stopped(job, plan, &records, &why)?);
                     }
                     Cause::BeadLost(error) => {
