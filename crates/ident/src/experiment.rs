@@ -66,7 +66,7 @@ pub struct Plan {
     pub period_s: f64,
     /// Segments in order.
     pub segments: Vec<PlannedSegment>,
-    /// Frames in a row without a bead that end the run.
+    /// Rows in a row without a position of a held bead that spoil a segment; without a rig file they end the run.
     pub lost_frames: usize,
 }
 

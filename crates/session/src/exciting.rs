@@ -23,8 +23,9 @@ pub struct Exciting {
     /// Tick up to which nothing is played.
     quiet_until: usize,
     now: Option<usize>,
-    /// Tick in which the bead was frozen, and ticks after which its segment is given up.
+    /// Tick in which the freeze began.
     frozen_at: Option<usize>,
+    /// A freeze of so many ticks ends its segment.
     patience: usize,
 }
 

@@ -1,7 +1,7 @@
 //! Rate and age of a camera's frames, before anything is armed.
 
 use crate::failure::Failure;
-use crate::setup::camera_delay_advice;
+use crate::setup::{camera_delay_advice, delays_differ};
 use cellpos_rig::{Clock, PositionSource};
 use cellpos_runtime::Timing;
 use cellpos_runtime::realtime::{self, Request};
@@ -36,7 +36,7 @@ impl FrameAge {
         })
     }
 
-    /// What the age says against the file, and the remedy. A machine that stalls makes frames older: if that alone is worth saying, no
+    /// The difference from the file, if there is one, and the remedy. A machine that stalls makes frames older: if that alone is worth saying, no
     /// value is advised, and a file that may be right is not blamed.
     pub fn advice(self, timing: &Timing) -> Option<(String, &'static str)> {
         let Self {
@@ -45,18 +45,14 @@ impl FrameAge {
         } = self;
         let camera_delay_ms = timing.camera_delay_ms;
         let advice = camera_delay_advice(median_ms, timing)?;
-        let undisturbed = Timing {
-            camera_delay_ms: early_ms,
-            ..*timing
-        };
-        if camera_delay_advice(median_ms, &undisturbed).is_none() {
+        if !delays_differ(median_ms, early_ms, timing) {
             return Some((
                 advice,
                 "design the controller again, too: cellpos design --rig",
             ));
         }
         let between = (early_ms..=median_ms).contains(&camera_delay_ms);
-        if between || camera_delay_advice(early_ms, timing).is_none() {
+        if between || !delays_differ(early_ms, camera_delay_ms, timing) {
             return None;
         }
         Some((

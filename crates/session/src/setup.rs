@@ -366,15 +366,18 @@ pub(crate) fn command_delay_s(model: &Model) -> f64 {
         .max(0.0)
 }
 
-/// Difference of delays that gives a warning, as a fraction of the period: half a period costs a controller some degrees of margin. All
-/// comparisons of delays use this figure, so that no advice contradicts another.
-const WORTH_SAYING: f64 = 0.3;
+/// Whether two delays differ so much that a warning is given. All comparisons of delays ask this, so that no advice contradicts another.
+pub(crate) fn delays_differ(one_ms: f64, other_ms: f64, timing: &Timing) -> bool {
+    /// As a fraction of the period: half a period costs a controller some degrees of margin.
+    const WORTH_SAYING: f64 = 0.3;
+    (one_ms - other_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3
+}
 
 /// Remedy if the age of frames at their ticks differs from the rig file. `found_ms` comes from the frames' stamps: from the middle of an
 /// exposure to the tick that used it. Every measurement of this key has this definition.
 pub fn camera_delay_advice(found_ms: f64, timing: &Timing) -> Option<String> {
     let configured_ms = timing.camera_delay_ms;
-    ((found_ms - configured_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
+    delays_differ(found_ms, configured_ms, timing).then(|| {
         format!(
             "frames are {found_ms:.2} ms old when they are used (middle of the exposure to the tick), rig.toml says {configured_ms} ms: \
              write [timing] camera_delay_ms = {found_ms:.2} and design the controller again"
@@ -389,7 +392,7 @@ pub fn model_delay_warning(model: &Model, timing: &Timing) -> Option<String> {
     if let Some(age_s) = model.frame_age_s {
         return camera_delay_advice(age_s * 1e3, timing);
     }
-    ((measured_ms - rig_ms).abs() > WORTH_SAYING * timing.period_us * 1e-3).then(|| {
+    delays_differ(measured_ms, rig_ms, timing).then(|| {
         format!(
             "the model has a delay of {measured_ms:.2} ms from a command to the tick that uses its picture, rig.toml says camera_delay_ms = {rig_ms}: run cellpos identify again, which separates the two parts of that delay"
         )
@@ -418,7 +421,7 @@ pub fn controller(
             ));
         }
         let file = ControllerFile::load(Path::new(name)).map_err(Failure::input)?;
-        if (file.delay_ms * 1e-3 - loop_delay_s).abs() > WORTH_SAYING * sample_s {
+        if delays_differ(file.delay_ms, loop_delay_s * 1e3, timing) {
             return Err(Failure::bad_input(
                 format!(
                     "{name}: it is for a loop delay of {} ms, but the rig has {} ms",

@@ -169,7 +169,8 @@ impl RigFile {
         })
     }
 
-    /// Lowest and highest position at which the picture shows a bead whole, um. A real camera is opened for this and closed again.
+    /// Lowest and highest position at which the picture shows a bead whole, um; of the emulated camera, the borders of its
+    /// picture. A real camera is opened for this and closed again.
     ///
     /// # Errors
     /// There is no calibration, or the camera cannot be opened.

@@ -86,7 +86,7 @@ pub struct Ran {
 }
 
 /// Runs one experiment, all its times multiplied by `share`. After a lost bead it runs again what is missing, as `identify` does. A
-/// record so far is written after each part, so that it survives the process: the first to `file`, the others beside it.
+/// record so far is written after each part, so that it survives the process: the first to `file`, the others to the same folder.
 ///
 /// # Errors
 /// The rig failed, or a run ended early and a person must act; the records are in their files.
@@ -108,7 +108,7 @@ pub fn run_experiment(
     })
 }
 
-/// Runs a plan until all of it is measured; `progress` gets the part that is.
+/// Runs a plan until every segment is measured; `progress` gets the measured part.
 fn run_plan(
     rig: &OnRig,
     plan: &Plan,
@@ -139,26 +139,25 @@ fn run_plan(
             segment: &mut segment,
         };
         let acquired = rig.acquire(plan, &todo, &mut listener)?;
-        match keep(&acquired) {
+        let kept = keep(&acquired);
+        let Some(trouble @ Trouble::Ended(ended)) = &acquired.trouble else {
+            // A record is of use although the bead was out of sight in some segments.
+            records.push((file, kept?));
+            return ran(&rig, records, acquired.age_s);
+        };
+        match kept {
             Ok(record) => records.push((file, record)),
-            Err(failure) if acquired.trouble.is_none() => return Err(failure),
             Err(failure) => tracing::warn!("{}: {}", file.display(), failure.text()),
         }
         segments.extend_from_slice(&acquired.records);
         again.learn(&acquired, &segments);
+        if !again.may_go_on(trouble) {
+            return Err(ended.failure(&what_is_kept(&records)));
+        }
+        tracing::warn!("{}; measuring again what is missing", trouble.seen());
         done = segments.len() as f64 / plan.segments.len() as f64;
         if !acquired.records.is_empty() {
             rig.file.rested_um = Some(acquired.neutral_um);
-        }
-        match &acquired.trouble {
-            Some(trouble @ Trouble::Ended(ended)) => {
-                if !again.may_go_on(trouble) {
-                    return Err(ended.failure(&what_is_kept(&records)));
-                }
-                tracing::warn!("{}; measuring again what is missing", trouble.seen());
-            }
-            // A record is of use although the bead was out of sight in some of its segments.
-            Some(Trouble::Spoilt { .. }) | None => return ran(&rig, records, acquired.age_s),
         }
     }
 }
@@ -197,6 +196,14 @@ fn ran(rig: &OnRig, records: Vec<(PathBuf, Record)>, age_s: Option<f64>) -> Resu
     })
 }
 
+/// The name of a file's record.
+pub fn record_name(file: &Path) -> String {
+    file.file_stem().map_or_else(
+        || file.display().to_string(),
+        |stem| stem.to_string_lossy().into_owned(),
+    )
+}
+
 /// A run as a record.
 fn record(
     acquired: &Acquired,
@@ -204,12 +211,10 @@ fn record(
     period_s: f64,
     exposure_s: f64,
 ) -> Result<Record, Failure> {
-    let name = file
-        .file_stem()
-        .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
     let (pzt_um, bead_um) = &acquired.rows;
     let time_s: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * period_s).collect();
-    let mut record = Record::from_rows(&name, &time_s, pzt_um, bead_um).map_err(refused)?;
+    let mut record =
+        Record::from_rows(&record_name(file), &time_s, pzt_um, bead_um).map_err(refused)?;
     record.unseen.clone_from(&acquired.unseen);
     record.frame_age_s.clone_from(&acquired.frame_age_s);
     record.late_command.clone_from(&acquired.late_command);
@@ -361,10 +366,8 @@ pub fn look(
 /// The path itself if there is no such file yet, else one with the next free number: `survey-1.csv`, then `survey-2.csv`. Nothing is
 /// overwritten.
 fn free_path(file: &Path) -> PathBuf {
-    let stem = file
-        .file_stem()
-        .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-    let stem = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    let name = record_name(file);
+    let stem = name.trim_end_matches(|c: char| c.is_ascii_digit());
     let stem = stem.trim_end_matches('-');
     let numbered = (1..).map(|n| file.with_file_name(format!("{stem}-{n}.csv")));
     std::iter::once(file.to_owned())

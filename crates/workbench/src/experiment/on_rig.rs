@@ -90,7 +90,7 @@ pub enum Trouble {
         of: usize,
         /// The first one, and the reason.
         first: String,
-        /// The bead left the view in one of them. If in none, machine or line stalled, or an operator froze the bead.
+        /// The bead left the view in a segment. Otherwise machine or line stalled, or an operator froze the bead.
         out_of_view: bool,
     },
 }
@@ -189,7 +189,7 @@ impl OnRig {
     pub fn bead_amplitude_um(&self, wanted_um: f64) -> Result<f64, Failure> {
         let [low_um, high_um] = self.file.whole_bead_um()?;
         let half_um = 0.5 * high_um.min(-low_um);
-        // A target outside the picture has an error of its own, when the bead is to be held there.
+        // Holding a bead at a target outside the picture has a separate error.
         Ok(if half_um > 0.0 {
             wanted_um.min(half_um)
         } else {

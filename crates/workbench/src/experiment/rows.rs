@@ -210,7 +210,7 @@ impl Rows {
                 let at = row + 1 - gap;
                 let frozen = usable[at..=row].iter().position(|usable| !usable);
                 return Err(match frozen.map(|after| at + after) {
-                    // What came before the freeze is its reason.
+                    // The rows before a freeze show its reason.
                     Some(frozen) => Spoilt::Frozen {
                         at: frozen,
                         out_of_view: out_of_view(at..frozen),

@@ -1,7 +1,9 @@
 //! The columns of a file: one reader for `identify`, `reconcile` and `simulate`, so that all read the same files.
 
 use super::arrays::read_table;
-use crate::experiment::collect::{EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, refused};
+use crate::experiment::collect::{
+    EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, record_name, refused,
+};
 use cellpos_numeric::units::Hertz;
 use cellpos_reconcile::Record;
 use cellpos_session::Failure;
@@ -104,11 +106,7 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         came.clear();
         late.clear();
     }
-    let name = path.file_stem().map_or_else(
-        || path.display().to_string(),
-        |s| s.to_string_lossy().into_owned(),
-    );
-    let mut record = Record::from_rows(&name, &t, &u, &y).map_err(refused)?;
+    let mut record = Record::from_rows(&record_name(path), &t, &u, &y).map_err(refused)?;
     if wanted.held {
         hold_over_gaps(&mut record);
         record.frame_age_s = in_rows(&record, &t, &age);

@@ -7,7 +7,7 @@ use cellpos_reconcile::Record;
 use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
 use cellpos_session::sessions;
-use cellpos_workbench::experiment::collect::{neutral_um, refused};
+use cellpos_workbench::experiment::collect::{neutral_um, record_name, refused};
 use cellpos_workbench::experiment::on_rig::{frame_age_ns, frames_passed_over, is_unseen};
 use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::collections::BTreeMap;
@@ -126,13 +126,6 @@ impl Noises {
 
 pub(super) fn is_run(path: &Path) -> bool {
     path.join("ticks.arrow").exists()
-}
-
-fn record_name(path: &Path) -> String {
-    path.file_stem().map_or_else(
-        || path.display().to_string(),
-        |s| s.to_string_lossy().into_owned(),
-    )
 }
 
 pub(super) fn read(path: &Path, columns: &Columns, held: bool) -> Result<Record, Failure> {

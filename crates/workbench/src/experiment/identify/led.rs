@@ -251,8 +251,8 @@ mod tests {
         let (switched_s, frames) = switch(&mut camera, |_| Ok(()), &edges_s, end_ns).unwrap();
         assert_eq!(switched_s.len(), edges_s.len());
         assert!(frames.mid_s.len() > 200, "{}", frames.mid_s.len());
-        // With the frames a quarter of them would be late by less than a quarter of a period, as for any even spread. A busy machine makes
-        // edges late, none early.
+        // Edges that wait for frames are late by 0 to 1 period, evenly: a quarter by less than a quarter. A busy machine makes edges late,
+        // none early.
         let late_s: Vec<f64> = (switched_s.iter().zip(&edges_s))
             .map(|(switched_s, edge_s)| switched_s - edge_s)
             .collect();

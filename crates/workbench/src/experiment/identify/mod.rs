@@ -262,14 +262,15 @@ fn on_rig(
         };
         let acquired = rig.acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())?;
         records = joined(&records, &acquired.records);
+        again.learn(&acquired, &records);
         if !acquired.records.is_empty() {
             // Where the zero flow has wandered meanwhile the flow is slow and a bead stays in view: the next run begins there.
             rig.file.rested_um = Some(acquired.neutral_um);
         }
         age_s = acquired.age_s.unwrap_or(age_s);
         fix_noise_um = acquired.fix_noise_um.or(fix_noise_um);
-        board = Some(acquired.board.clone());
-        runs.extend(acquired.run.clone());
+        board = Some(acquired.board);
+        runs.extend(acquired.run);
         let gentler = todo.iter().filter(|turn| turn.part < 1.0);
         let done = gentler.filter(|turn| records.iter().any(|r| r.index == turn.index));
         warnings.extend(done.map(|turn| {
@@ -280,7 +281,6 @@ fn on_rig(
                 turn.part
             )
         }));
-        again.learn(&acquired, &records);
         match acquired.trouble {
             None => {}
             Some(trouble) if again.may_go_on(&trouble) => {
