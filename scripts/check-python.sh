@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # The Python package: installed into a separate environment as a user would, then its tests, with the snippets of docs/python.md.
-# The program is built with the profile and into the folder that the tests of the workspace use, so that nothing is built twice.
 # Skipped with the reason where the environment cannot be made.
-#   scripts/check-python.sh [WORDS]   all of it; the words are for pytest
-#   scripts/check-python.sh install   the environment only
+#   scripts/check-python.sh [WORDS]          all of it; the words are for pytest
+#   scripts/check-python.sh source [WORDS]   not installed: the package from its sources, with the program of the workspace's tests.
+#                                            The package's own program has other features, and is built for minutes
+#   scripts/check-python.sh install          the environment only
 set -euo pipefail
 cd "$(dirname "$0")/.."
 env=target/python
@@ -15,11 +16,19 @@ fi
 [ "${1:-}" = install ] && exit 0
 # The whole workspace, whose features the tests have built: one package alone may have others, and is built anew.
 cargo build -q --locked --workspace --bin firmware-sim
-CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
-    "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
+unset CELLPOS_PROGRAM
+if [ "${1:-}" = source ]; then
+    shift
+    cargo build -q --locked --workspace --bin cellpos
+    "$env/bin/pip" uninstall -q -y cellpos
+    export PYTHONPATH="$PWD/python/src" CELLPOS_PROGRAM="$PWD/target/debug/cellpos" PATH="$PWD/target/debug:$PATH"
+else
+    CARGO_TARGET_DIR="$PWD/target" MATURIN_PEP517_ARGS="--profile dev" PATH="$PWD/$env/bin:$PATH" \
+        "$env/bin/pip" install -q --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall ./python
+fi
 cd python
 tests() {
-    env -u CELLPOS_PROGRAM "../$env/bin/python" -m pytest -q "$@"
+    "../$env/bin/python" -m pytest -q "$@"
 }
 if [ $# -gt 0 ]; then
     tests "$@"

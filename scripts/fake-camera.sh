@@ -27,7 +27,7 @@ fi
 # The fake camera sleeps for 100 ms whenever it is a millisecond late: real-time priority keeps it from being late.
 fifo=()
 if chrt -f 20 true 2>/dev/null; then fifo=(chrt -f 20); else echo "no real-time priority: expect stalls of 100 ms"; fi
-# The packages without a test of that name bring the features of the workspace, with which its tests have built most of it.
-build=(--locked -p cellpos-drivers -p cellpos-benches -p cellpos-firmware-sim --features cellpos-drivers/aravis --test all)
-cargo test "${build[@]}" fake_camera --no-run
-"${fifo[@]}" cargo test "${build[@]}" fake_camera -- --ignored --nocapture --test-threads 1
+# The whole workspace, whose features its tests have built: one package alone may have others, and is built anew.
+build=(--locked --workspace --features cellpos-drivers/aravis --test fake_camera)
+cargo test "${build[@]}" --no-run
+"${fifo[@]}" cargo test "${build[@]}" -- --ignored --nocapture --test-threads 1

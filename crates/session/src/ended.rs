@@ -73,8 +73,8 @@ impl Ended {
         )
     }
 
-    /// Whether the cause may be over by now, for example a stall of this machine or of the line. Another run may then succeed
-    /// without a person's action. A lost bead, or a board that another program holds, is not such a cause.
+    /// Whether the cause may be over by now, for example a stall of this machine, of the line or of the camera. Another run may then
+    /// succeed without a person's action. A lost bead, or a board that another program holds, is not such a cause.
     pub fn may_pass(&self) -> bool {
         self.refusal == Some(Refusal::Disturbed)
             || matches!(
@@ -82,6 +82,7 @@ impl Ended {
                 Some(
                     SafeReason::Board
                         | SafeReason::BoardNotObeying
+                        | SafeReason::CameraLost
                         | SafeReason::LateTicks
                         | SafeReason::LinkLost
                         | SafeReason::StaleFrames

@@ -40,6 +40,21 @@ impl Failure {
         }
     }
 
+    /// The same failure with one more remedy after its own.
+    #[must_use]
+    pub fn with_remedy(self, remedy: &str) -> Self {
+        let add = |report: miette::Report| {
+            let own = report.help().map(|help| format!("{help}; "));
+            let error: &(dyn std::error::Error + Send + Sync) = report.as_ref();
+            let help = format!("{}{remedy}", own.unwrap_or_default());
+            miette::miette!(help = help, "{}", describe(error))
+        };
+        match self {
+            Self::BadInput(report) => Self::BadInput(add(report)),
+            Self::Failed(report) => Self::Failed(add(report)),
+        }
+    }
+
     /// Bad input, in the words of a library's error.
     pub fn input(error: impl std::error::Error + Send + Sync + 'static) -> Self {
         Self::BadInput(miette::Report::from_err(error))

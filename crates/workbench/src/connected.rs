@@ -115,7 +115,7 @@ fn camera(bench: &Bench) -> Result<CameraSeen, Failure> {
         name,
         size_px: [buffer.width, buffer.height],
         rate_hz,
-        age_ms: Quantiles::of(ages_ms),
+        age_ms: Quantiles::of(&ages_ms),
         used,
     })
 }

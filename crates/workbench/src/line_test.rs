@@ -2,6 +2,7 @@
 
 use crate::bench::Board;
 use cellpos_link::Status;
+use cellpos_numeric::statistics;
 use cellpos_rig::{Actuator, ActuatorInfo, Clock};
 use cellpos_session::Failure;
 use serde::Serialize;
@@ -19,19 +20,13 @@ pub struct Quantiles {
 }
 
 impl Quantiles {
-    /// Of values in any order.
-    pub fn of(mut values: Vec<f64>) -> Self {
-        values.sort_by(f64::total_cmp);
-        let at = |part: f64| {
-            let last = values.len().saturating_sub(1) as f64;
-            let at = (last * part).round() as usize;
-            values.get(at).copied().unwrap_or(0.0)
-        };
-        Self {
-            p50: at(0.5),
-            p99: at(0.99),
-            max: at(1.0),
+    /// Of values in any order; 0 without any.
+    pub fn of(values: &[f64]) -> Self {
+        if values.is_empty() {
+            return Self::default();
         }
+        let [p50, p99, max] = statistics::quantiles(values, [0.5, 0.99, 1.0]);
+        Self { p50, p99, max }
     }
 }
 
@@ -100,8 +95,8 @@ pub fn run(board: &mut Board, count: u32) -> Result<LineTest, Failure> {
         applied_um: cellpos_link::um_from_picometres(status.applied_pm),
         sent: count,
         lost,
-        round_trip_ms: Quantiles::of(trips_ms),
-        jitter_ms: Quantiles::of(jitter_ms),
+        round_trip_ms: Quantiles::of(&trips_ms),
+        jitter_ms: Quantiles::of(&jitter_ms),
         bad_frames: status.bad_frames,
         ignored: status.ignored,
         late: status.late,

@@ -9,6 +9,9 @@ use super::log::{Instant, Log};
 use super::pace::{HOUSEKEEPING_NS, LONGEST_SLEEP_NS, monotonic_ns, send_frames, wait};
 use super::usb::Usb;
 use cellpos_emulator::RigInABox;
+use rustix::mm::{MlockAllFlags, mlockall};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::flag::register;
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
@@ -28,13 +31,10 @@ const PRIORITY: u8 = 60;
 pub(crate) fn run(args: &Args) -> Result<(), ProgramError> {
     let setup = args.setup()?;
     let stop = Arc::new(AtomicBool::new(false));
-    let asked = Arc::clone(&stop);
-    ctrlc::set_handler(move || asked.store(true, Ordering::Relaxed)).map_err(|error| {
-        ProgramError::System {
-            doing: "listening for signals",
-            source: std::io::Error::other(error),
-        }
-    })?;
+    for signal in [SIGINT, SIGTERM, SIGHUP] {
+        register(signal, Arc::clone(&stop))
+            .map_err(ProgramError::system("listening for signals"))?;
+    }
     let start_ns = monotonic_ns();
     let socket = args.socket.clone().unwrap_or_else(|| {
         std::env::temp_dir().join(format!("firmware-sim-{}.sock", std::process::id()))
@@ -115,6 +115,7 @@ fn announce(board: &Path, link: Option<&Path>, server: &FrameServer) -> Result<(
     say().map_err(ProgramError::system("writing to standard output"))
 }
 
+/// Real-time scheduling, and the memory in use kept in RAM: a page that is fetched again stalls board and camera together.
 fn ask_for_real_time() {
     let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     let granted = ThreadPriorityValue::try_from(PRIORITY)
@@ -131,6 +132,12 @@ fn ask_for_real_time() {
         eprintln!(
             "firmware-sim: DEGRADED: SCHED_FIFO was refused ({error}): frames and board may lag behind by \
              milliseconds; allow it with `ulimit -r {PRIORITY}` or CAP_SYS_NICE, or say --best-effort"
+        );
+    }
+    if let Err(error) = mlockall(MlockAllFlags::CURRENT) {
+        eprintln!(
+            "firmware-sim: DEGRADED: its memory was not locked ({error}): frames and board may lag behind by milliseconds; allow it \
+             with `ulimit -l` or CAP_IPC_LOCK, or say --best-effort"
         );
     }
 }

@@ -2,9 +2,9 @@
 
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use cellpos_drivers::sources::{self, Playback, Region};
-use cellpos_numeric::statistics;
 use cellpos_numeric::units::Seconds;
 use cellpos_rig::{Camera, CameraError, Clock, FrameBuffer};
+use cellpos_workbench::line_test::Quantiles;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -85,14 +85,6 @@ struct Delivery {
     intervals: Vec<(Option<f64>, u64)>,
     ended: Option<String>,
     losses: Option<Losses>,
-}
-
-/// Quantiles, ms.
-#[derive(Debug, Serialize)]
-struct Quantiles {
-    p50: f64,
-    p99: f64,
-    max: f64,
 }
 
 /// What an industrial camera's driver counted.
@@ -325,8 +317,8 @@ fn watch(camera: &mut dyn Camera, args: &Args) -> Delivery {
         dropped,
         doubled_or_stale: not_new,
         longest_gap_ms: intervals_ms.iter().copied().fold(0.0, f64::max),
-        interval_ms: quantiles(intervals_ms),
-        age_ms: quantiles(ages_ms),
+        interval_ms: Quantiles::of(&intervals_ms),
+        age_ms: Quantiles::of(&ages_ms),
         intervals: CLASSES
             .iter()
             .map(|c| c.is_finite().then_some(*c))
@@ -335,14 +327,6 @@ fn watch(camera: &mut dyn Camera, args: &Args) -> Delivery {
         ended,
         losses: None,
     }
-}
-
-fn quantiles(mut values: Vec<f64>) -> Quantiles {
-    if values.is_empty() {
-        values.push(0.0);
-    }
-    let [p50, p99, max] = statistics::quantiles(&values, [0.5, 0.99, 1.0]);
-    Quantiles { p50, p99, max }
 }
 
 fn report(args: &Args, mut delivery: Delivery, losses: Option<Losses>) -> CommandResult {

@@ -1,6 +1,5 @@
 //! Cameras and recordings as sources of positions.
 
-mod fake_camera;
 mod films;
 mod published;
 mod recordings;

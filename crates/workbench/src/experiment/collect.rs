@@ -138,7 +138,11 @@ fn run_plan(
             progress: &mut heard,
             segment: &mut segment,
         };
-        let acquired = rig.acquire(plan, &todo, &mut listener)?;
+        let acquired = rig.acquire(plan, &todo, &mut listener);
+        let acquired = acquired.map_err(|failure| match records.is_empty() {
+            true => failure,
+            false => failure.with_remedy(&what_is_kept(&records)),
+        })?;
         let kept = keep(&acquired);
         let Some(trouble @ Trouble::Ended(ended)) = &acquired.trouble else {
             // A record is of use although the bead was out of sight in some segments.

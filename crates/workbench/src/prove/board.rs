@@ -173,7 +173,7 @@ fn line(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
         }
         due_ns = (due_ns + 1_000_000).max(t.now_ns());
     }
-    let trip = Quantiles::of(trips_ms);
+    let trip = Quantiles::of(&trips_ms);
     // The protocol promises a status within 10 ms of its command.
     sheet.judge(
         of("round trip"),
@@ -198,7 +198,7 @@ fn line(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
             _ => None,
         })
         .collect();
-    let jitter = Quantiles::of(spacing);
+    let jitter = Quantiles::of(&spacing);
     sheet.judge(
         of("jitter on its own clock"),
         jitter.p50 < 0.5,

@@ -111,7 +111,7 @@ fn watched(sheet: &mut Sheet, bench: &Bench, duration_s: f64) -> Result<(), Fail
         .iter()
         .map(|ms| (ms - period_ms).abs())
         .collect();
-    let jitter = Quantiles::of(off);
+    let jitter = Quantiles::of(&off);
     sheet.judge(
         ("camera", "jitter of arrival"),
         jitter.p99 < 0.5 * period_ms,
@@ -122,7 +122,7 @@ fn watched(sheet: &mut Sheet, bench: &Bench, duration_s: f64) -> Result<(), Fail
             jitter.p50, jitter.max
         ),
     );
-    let age = Quantiles::of(ages_ms);
+    let age = Quantiles::of(&ages_ms);
     let oldest_ms = bench.file().timing.oldest_ms;
     sheet.judge(
         ("camera", "age on arrival"),

@@ -219,7 +219,7 @@ fn times(sheet: &mut Sheet, frames: &[Came], rate_hz: f64) {
             period_ns * 1e-6
         ),
     );
-    let age = Quantiles::of(ages_ms);
+    let age = Quantiles::of(&ages_ms);
     sheet.judge(
         of("stamps on CLOCK_MONOTONIC"),
         early == 0 && age.p50 < 1000.0,

@@ -92,12 +92,12 @@ fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it
     assert!(held_um < 0.2, "{held_um} um at the end");
 }
 
-#[test]
-fn an_experiment_goes_on_with_the_next_bead_and_keeps_a_record_of_each() {
+/// An experiment in which every run ends early, after a fault for longer than the loop waits.
+fn an_experiment_goes_on_after(kind: FaultKind) {
     let mut file = RigFile::default();
-    // Each run begins the emulated time anew, and loses its bead for longer than the loop waits.
+    // Each run begins the emulated time anew.
     file.emulator.faults.event.push(FaultEvent {
-        kind: FaultKind::LoseBead,
+        kind,
         at_s: 8.0,
         for_s: Some(9.0),
     });
@@ -116,4 +116,14 @@ fn an_experiment_goes_on_with_the_next_bead_and_keeps_a_record_of_each() {
     for (file, record) in &ran.records {
         assert!(file.is_file() && record.frames() > 1000, "{record:?}");
     }
+}
+
+#[test]
+fn an_experiment_goes_on_with_the_next_bead_and_keeps_a_record_of_each() {
+    an_experiment_goes_on_after(FaultKind::LoseBead);
+}
+
+#[test]
+fn an_experiment_goes_on_when_the_camera_delivers_again() {
+    an_experiment_goes_on_after(FaultKind::DropFrames);
 }

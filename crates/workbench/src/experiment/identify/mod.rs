@@ -17,7 +17,7 @@ use cellpos_session::view::Pages;
 use cellpos_session::{Failure, setup};
 use held_bead::{HeldBead, Setup};
 use led::DelayTest;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// How to excite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -260,7 +260,12 @@ fn on_rig(
             progress: &mut *progress,
             segment: &mut segment,
         };
-        let acquired = rig.acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())?;
+        let acquired = rig
+            .acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())
+            .map_err(|failure| match kept(job, plan, &records) {
+                Ok(Some(path)) => failure.with_remedy(&resume(&path, plan, &records)),
+                Ok(None) | Err(_) => failure,
+            })?;
         records = joined(&records, &acquired.records);
         again.learn(&acquired, &records);
         if !acquired.records.is_empty() {
@@ -333,6 +338,16 @@ fn kept(job: &Job, plan: &Plan, records: &[RecordedSegment]) -> Result<Option<Pa
     Ok(Some(path.clone()))
 }
 
+/// How to continue with the segments that a file keeps.
+fn resume(path: &Path, plan: &Plan, records: &[RecordedSegment]) -> String {
+    format!(
+        "continue with the same arguments and --resume {}: {} of {} segments are kept",
+        path.display(),
+        records.len(),
+        plan.segments.len()
+    )
+}
+
 /// The failure of a stopped identification: the finished segments are kept, and the message says how to continue.
 fn stopped(
     job: &Job,
@@ -342,12 +357,7 @@ fn stopped(
 ) -> Result<Failure, Failure> {
     let kept = kept(job, plan, records)?;
     let go_on = match &kept {
-        Some(path) => format!(
-            "continue with the same arguments and --resume {}: {} of {} segments are kept",
-            path.display(),
-            records.len(),
-            plan.segments.len()
-        ),
+        Some(path) => resume(path, plan, records),
         None => "start again: no segment was finished".to_string(),
     };
     Ok(match why {

@@ -1,5 +1,4 @@
 //! Industrial cameras against Aravis' fake GigE Vision camera on loopback: run by `scripts/fake-camera.sh`.
-#![cfg(feature = "aravis")]
 // The library has no safe way to draw into the fake camera's stream.
 #![allow(unsafe_code)]
 
