@@ -85,7 +85,7 @@ pub fn run(board: &mut Board, count: u32) -> Result<LineTest, Failure> {
         // A late answer shifts the later pings: the spacing is never below a period.
         due_ns = (due_ns + PERIOD_NS).max(clock.now_ns());
     }
-    let jitter_ms = (times_us.windows(2))
+    let jitter_ms: Vec<f64> = (times_us.windows(2))
         .filter(|pair| pair[1].0 == pair[0].0 + 1)
         .map(|pair| ((pair[1].1 - pair[0].1) as f64 * 1e-3 - 1.0).abs())
         .collect();

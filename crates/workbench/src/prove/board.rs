@@ -189,7 +189,7 @@ fn line(sheet: &mut Sheet, t: &mut Talk) -> Result<(), Failure> {
         "0",
         format!("of {PINGS}"),
     );
-    let spacing = times_us
+    let spacing: Vec<f64> = times_us
         .windows(2)
         .filter_map(|pair| match pair {
             [(a, before_us), (b, after_us)] if b - a == 1 => {

@@ -107,7 +107,7 @@ fn watched(sheet: &mut Sheet, bench: &Bench, duration_s: f64) -> Result<(), Fail
         ),
         format!("{repeated} came twice"),
     );
-    let off = intervals_ms
+    let off: Vec<f64> = intervals_ms
         .iter()
         .map(|ms| (ms - period_ms).abs())
         .collect();
