@@ -220,12 +220,13 @@ fn an_identification_goes_on_with_the_bead_that_comes_after_one_that_was_lost_fo
 }
 
 #[test]
-fn an_identification_stopped_by_a_lost_camera_keeps_its_segments_and_goes_on_from_them() {
+fn an_identification_stopped_by_a_pzt_that_goes_the_wrong_way_keeps_its_segments_and_goes_on_from_them()
+ {
     let folder = tempfile::tempdir().unwrap();
     rig(
         folder.path(),
         "bad.toml",
-        "[emulator.faults]\nevent = [{ kind = \"drop-frames\", at_s = 17.0 }]\n",
+        "[emulator.faults]\nevent = [{ kind = \"gain-flip\", at_s = 17.0 }]\n",
     );
     rig(folder.path(), "good.toml", "[emulator]\nseed = 2\n");
     let ran = cellpos(
@@ -235,7 +236,7 @@ fn an_identification_stopped_by_a_lost_camera_keeps_its_segments_and_goes_on_fro
     assert_eq!(ran.code, Some(1), "{}\n{}", ran.out, ran.err);
     let text = message(&ran);
     assert!(
-        text.contains("no frames came for longer") && text.contains("3 of 5 segments are kept"),
+        text.contains("did not follow the commands") && text.contains("3 of 5 segments are kept"),
         "{text}"
     );
     assert!(text.contains("--resume m.partial.json"), "{text}");
