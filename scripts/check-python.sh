@@ -3,7 +3,7 @@
 # Skipped with the reason where the environment cannot be made.
 #   scripts/check-python.sh [WORDS]          all of it; the words are for pytest
 #   scripts/check-python.sh source [WORDS]   not installed: the package from its sources, with the program of the workspace's tests.
-#                                            The package's own program has other features, and is built for minutes
+#                                            The package's own program has fewer features, and is built for minutes
 #   scripts/check-python.sh install          the environment only
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -14,12 +14,11 @@ if ! { [ -x "$env/bin/python" ] || python3 -m venv "$env"; } \
     exit 0
 fi
 [ "${1:-}" = install ] && exit 0
-# The whole workspace, whose features the tests have built: one package alone may have others, and is built anew.
-cargo build -q --locked --workspace --bin firmware-sim
+# The programs come with the tests of the workspace. Alone they have fewer features, and half of it is built again.
+cargo test -q --locked --workspace --no-run
 unset CELLPOS_PROGRAM
 if [ "${1:-}" = source ]; then
     shift
-    cargo build -q --locked --workspace --bin cellpos
     "$env/bin/pip" uninstall -q -y cellpos
     export PYTHONPATH="$PWD/python/src" CELLPOS_PROGRAM="$PWD/target/debug/cellpos" PATH="$PWD/target/debug:$PATH"
 else
