@@ -270,3 +270,28 @@ fn an_interrupt_freezes_the_bead_and_then_parks() {
     let run = RunReader::open(&run_folder(folder.path()).unwrap()).unwrap();
     assert!(run.ticks().unwrap().1.finished);
 }
+
+#[test]
+fn a_rig_that_goes_away_in_an_identification_leaves_its_segments_and_a_word_of_how_to_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    write_rig(folder.path(), HOLD_WATCHDOG_MS);
+    let rig = RigInABox::start(folder.path(), &[]);
+    let line = "identify --rig rig.toml --frames off --frequency 20Hz,40Hz,80Hz,90Hz --led-edges 0 --bootstrap 0 --out m.toml";
+    let mut child = cellpos(folder.path(), line)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let kept = folder.path().join("m.partial.json");
+    wait_until("a segment is measured", || {
+        kept.exists() || child.try_wait().unwrap().is_some()
+    });
+    // Board and camera together: the run ends, and the next one finds no rig.
+    drop(rig);
+    let out = child.wait_with_output().unwrap();
+    let text = String::from_utf8_lossy(&out.stderr).replace(['│', '\n'], " ");
+    let text = text.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(!out.status.success() && kept.exists(), "{text}");
+    assert!(text.contains("measuring again what is missing"), "{text}");
+    assert!(text.contains("--resume m.partial.json"), "{text}");
+}

@@ -220,8 +220,7 @@ fn an_identification_goes_on_with_the_bead_that_comes_after_one_that_was_lost_fo
 }
 
 #[test]
-fn an_identification_stopped_by_a_pzt_that_goes_the_wrong_way_keeps_its_segments_and_goes_on_from_them()
- {
+fn a_wrong_sign_stops_an_identification_which_keeps_its_segments_and_goes_on_from_them() {
     let folder = tempfile::tempdir().unwrap();
     rig(
         folder.path(),
