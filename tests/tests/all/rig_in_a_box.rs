@@ -276,7 +276,7 @@ fn a_rig_that_goes_away_in_an_identification_leaves_its_segments_and_a_word_of_h
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), HOLD_WATCHDOG_MS);
     let rig = RigInABox::start(folder.path(), &[]);
-    let line = "identify --rig rig.toml --frames off --frequency 20Hz,40Hz,80Hz,90Hz --led-edges 0 --bootstrap 0 --out m.toml";
+    let line = "identify --rig rig.toml --frequency 20Hz,40Hz,80Hz,90Hz --led-edges 0 --bootstrap 0 --out m.toml";
     let mut child = cellpos(folder.path(), line)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
