@@ -82,4 +82,5 @@ echo "firmware mps2-an386: no panic path, no double precision, no allocator"
 
 [ "${1:-all}" = loop ] || rp2350
 # The programs come with the tests. Alone they have fewer features, and half of the workspace is built again.
+cargo test --workspace --locked --no-run
 CELLPOS_FIRMWARE="$firmware" cargo test --workspace --locked --test all firmware_qemu:: -- --ignored --nocapture --test-threads 1
