@@ -46,6 +46,13 @@ pub fn stdout(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
+/// What a command said on both outputs, on one line without the frames of its messages.
+pub fn said(output: &Output) -> String {
+    let text = stdout(output) + &String::from_utf8_lossy(&output.stderr);
+    let text = text.replace(['│', '\n'], " ");
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 /// Waits until `holds`, at most for [`PATIENCE`].
 ///
 /// # Panics

@@ -25,7 +25,7 @@ pub struct Exciting {
     now: Option<usize>,
     /// Tick in which the freeze began.
     frozen_at: Option<usize>,
-    /// A freeze of so many ticks ends its segment.
+    /// Length of a freeze that ends its segment, ticks.
     patience: usize,
 }
 

@@ -3,7 +3,7 @@
 //! The machine may stall for many milliseconds. So limits that a stall would break are wide, unless the test is about them.
 
 use cellpos_record::RunReader;
-use cellpos_tests::programs::{BoxRow, RigInABox, cellpos, stdout, wait_until};
+use cellpos_tests::programs::{BoxRow, RigInABox, alone, cellpos, said, stdout, wait_until};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -273,6 +273,8 @@ fn an_interrupt_freezes_the_bead_and_then_parks() {
 
 #[test]
 fn a_rig_that_goes_away_in_an_identification_leaves_its_segments_and_a_word_of_how_to_go_on() {
+    // Until the program has ended, which outlives its rig.
+    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), HOLD_WATCHDOG_MS);
     let rig = RigInABox::start(folder.path(), &[]);
@@ -289,8 +291,7 @@ fn a_rig_that_goes_away_in_an_identification_leaves_its_segments_and_a_word_of_h
     // Board and camera together: the run ends, and the next one finds no rig.
     drop(rig);
     let out = child.wait_with_output().unwrap();
-    let text = String::from_utf8_lossy(&out.stderr).replace(['│', '\n'], " ");
-    let text = text.split_whitespace().collect::<Vec<_>>().join(" ");
+    let text = said(&out);
     assert!(!out.status.success() && kept.exists(), "{text}");
     assert!(text.contains("measuring again what is missing"), "{text}");
     assert!(text.contains("--resume m.partial.json"), "{text}");

@@ -2,7 +2,7 @@
 //! box's own log, and what it advises settles.
 
 use cellpos_record::RunReader;
-use cellpos_tests::programs::{self, BoxRow, RigInABox};
+use cellpos_tests::programs::{self, BoxRow, RigInABox, said};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Output;
@@ -35,12 +35,6 @@ fn write_rig(folder: &Path, camera_delay_ms: f64, window_px: u32) {
          [timing]\ncamera_delay_ms = {camera_delay_ms}\noldest_ms = {oldest_ms}\n"
     );
     std::fs::write(folder.join("rig.toml"), text).expect("written");
-}
-
-fn said(out: &Output) -> String {
-    let text = programs::stdout(out) + &String::from_utf8_lossy(&out.stderr);
-    let text = text.replace(['│', '\n'], " ");
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 /// The setting that a command advises, ms.
