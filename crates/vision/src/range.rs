@@ -46,11 +46,11 @@ impl Range {
             blur_px: 0.0,
             snr,
         };
-        let mut trial = Trial::new(config)?;
+        let trial = Trial::new(config)?;
         if !trial.holds(own) {
             return None;
         }
-        let mut farthest = |(step, most): (f64, f64), changed: &dyn Fn(f64) -> Drawn| {
+        let farthest = |(step, most): (f64, f64), changed: &dyn Fn(f64) -> Drawn| {
             let count = (most / step).round() as usize;
             let amounts = (1..=count).map(|k| k as f64 * step);
             let held = amounts.take_while(|amount| trial.holds(changed(*amount)));
@@ -85,7 +85,15 @@ impl Range {
 struct Trial {
     config: LocaliserConfig,
     side: usize,
-    state: u64,
+    beads: Vec<Bead>,
+}
+
+/// Where a bead is drawn and looked for, and the noise about it: the same in every trial, so that only what is changed decides.
+struct Bead {
+    place: (f64, f64),
+    guess: (f64, f64),
+    /// Standard normal deviates, one for each pixel.
+    noise: Vec<f32>,
 }
 
 impl Trial {
@@ -95,46 +103,53 @@ impl Trial {
         // Grey levels of a camera that was calibrated are not those drawn here.
         config.noise = crate::PixelNoise::Estimated;
         let side = 2 * config.window_px + 5;
-        (side < 1000).then_some(Trial {
+        if side >= 1000 {
+            return None;
+        }
+        let mut random = Random(0x9E37_79B9_7F4A_7C15);
+        let middle = 0.5 * (side - 1) as f64;
+        let bead = |_| {
+            let place = random.within_a_pixel_of((middle, middle));
+            let noise = (0..side * side).map(|_| random.normal() as f32).collect();
+            Bead {
+                place,
+                noise,
+                // As a loop that expects the bead to within a pixel.
+                guess: random.within_a_pixel_of(place),
+            }
+        };
+        Some(Trial {
             config,
             side,
-            state: 0x9E37_79B9_7F4A_7C15,
+            beads: (0..BEADS).map(bead).collect(),
         })
     }
 
-    fn holds(&mut self, drawn: Drawn) -> bool {
+    fn holds(&self, drawn: Drawn) -> bool {
         let Ok(mut localiser) = Localiser::new(self.config.clone()) else {
             return false;
         };
-        self.state = 0x9E37_79B9_7F4A_7C15;
-        let mut found = 0;
-        for n in 0..BEADS {
-            let middle = 0.5 * (self.side - 1) as f64;
-            let place = (middle + self.uniform() - 0.5, middle + self.uniform() - 0.5);
-            let pixels = self.picture(&localiser, place, drawn);
+        let mut missed = 0;
+        for bead in &self.beads {
+            let pixels = self.picture(&localiser, bead, drawn);
             let frame = Frame {
                 width: self.side,
                 height: self.side,
                 pixels: Pixels::Mono16(&pixels),
             };
-            // As a loop that expects the bead to within a pixel.
-            let guess = (
-                place.0 + self.uniform() - 0.5,
-                place.1 + self.uniform() - 0.5,
-            );
-            let fix = localiser.locate(&frame, Some(guess));
-            let off_px = f64::hypot(fix.x_px - place.0, fix.y_px - place.1);
+            let fix = localiser.locate(&frame, Some(bead.guess));
+            let off_px = f64::hypot(fix.x_px - bead.place.0, fix.y_px - bead.place.1);
             let near = off_px < 0.5 * localiser.template().radius_px();
-            found += usize::from(fix.verdict == FixQuality::Good && near);
-            if found + BEADS - n - 1 < FOUND {
+            missed += usize::from(fix.verdict != FixQuality::Good || !near);
+            if missed > BEADS - FOUND {
                 return false;
             }
         }
         true
     }
 
-    fn picture(&mut self, localiser: &Localiser, (x, y): (f64, f64), drawn: Drawn) -> Vec<u16> {
-        let (side, template) = (self.side, localiser.template());
+    fn picture(&self, localiser: &Localiser, bead: &Bead, drawn: Drawn) -> Vec<u16> {
+        let (side, template, (x, y)) = (self.side, localiser.template(), bead.place);
         let contrast = CONTRAST * localiser.sign() as f32;
         let mut light: Vec<f32> = (0..side * side)
             .map(|k| {
@@ -146,19 +161,26 @@ impl Trial {
         if drawn.blur_px > 0.0 {
             blur(&mut light, side, drawn.blur_px);
         }
-        let noise = f64::from(CONTRAST) / drawn.snr;
-        light
-            .iter()
-            .map(|v| (BACKGROUND + v + (noise * self.normal()) as f32).round() as u16)
+        let noise = CONTRAST / drawn.snr as f32;
+        (light.iter().zip(&bead.noise))
+            .map(|(v, deviate)| (BACKGROUND + v + noise * deviate).round() as u16)
             .collect()
     }
+}
 
-    /// Numbers that are the same each time: xorshift64*.
+/// Numbers that are the same each time: xorshift64*.
+struct Random(u64);
+
+impl Random {
     fn uniform(&mut self) -> f64 {
-        self.state ^= self.state >> 12;
-        self.state ^= self.state << 25;
-        self.state ^= self.state >> 27;
-        (self.state.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    fn within_a_pixel_of(&mut self, (x, y): (f64, f64)) -> (f64, f64) {
+        (x + self.uniform() - 0.5, y + self.uniform() - 0.5)
     }
 
     fn normal(&mut self) -> f64 {
@@ -171,7 +193,8 @@ impl Trial {
 fn blur(light: &mut [f32], side: usize, sd_px: f64) {
     let reach = (3.0 * sd_px).ceil() as usize;
     let weight = |d: usize| (-0.5 * (d as f64 / sd_px).powi(2)).exp() as f32;
-    let sum: f32 = (1..=reach).map(|d| 2.0 * weight(d)).sum::<f32>() + 1.0;
+    let weights: Vec<f32> = (0..=reach).map(weight).collect();
+    let sum = 2.0 * weights.iter().skip(1).sum::<f32>() + 1.0;
     let mut line = vec![0.0_f32; side];
     for (along, across) in [(1, side), (side, 1)] {
         for k in 0..side {
@@ -180,7 +203,7 @@ fn blur(light: &mut [f32], side: usize, sd_px: f64) {
             }
             for n in 0..side {
                 let near = n.saturating_sub(reach)..(n + reach + 1).min(side);
-                let mean: f32 = near.map(|m| weight(m.abs_diff(n)) * line[m]).sum();
+                let mean: f32 = near.map(|m| weights[m.abs_diff(n)] * line[m]).sum();
                 light[k * across + n * along] = mean / sum;
             }
         }

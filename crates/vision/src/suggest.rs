@@ -137,10 +137,14 @@ fn found_in_scene(
             _ => break,
         }
     }
-    found.map(|found| found.suggestion)
+    // Many beads are drawn for a range: once, for the settings that were found.
+    found.map(|Found { suggestion, .. }| Suggestion {
+        range: Range::of(&suggestion.config, suggestion.snr),
+        ..suggestion
+    })
 }
 
-/// A suggestion, its template, and the fixes behind it with their frames, in the order of the frames.
+/// A suggestion without its range, its template, and the fixes behind it with their frames, in the order of the frames.
 struct Found {
     suggestion: Suggestion,
     template: Template,
@@ -324,9 +328,8 @@ fn learn(
         (TOLERANCE_MARGIN * needed).clamp(rough.template_tolerance, MOST_TOLERANCE);
     config.min_snr = (ROOM_FOR_NOISE * snr).clamp(1.0, 20.0);
     let max_step_px = step_px(&fits, reach_px);
-    let range = Range::of(&config, snr);
     let suggestion = Suggestion {
-        range,
+        range: None,
         config,
         max_step_px,
         objects,
