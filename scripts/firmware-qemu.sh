@@ -6,7 +6,6 @@
 #   scripts/firmware-qemu.sh build    the firmware for QEMU only
 #   scripts/firmware-qemu.sh loop     all but the firmware for the RP2350
 #   scripts/firmware-qemu.sh rp2350   the firmware for the RP2350 only
-#   scripts/firmware-qemu.sh check    whether that compiles, without its size
 #   scripts/firmware-qemu.sh install  the tools only
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -26,21 +25,16 @@ versions=$(dpkg-query -W -f '${Version}\n' rustc-web cargo-web rust-web-src | so
 
 # Debian's own tools, whatever else is installed. Nightly features only for -Zbuild-std.
 target="$PWD/target/firmware"
-compile() { # cargo's command, folder, triple
-  local command=$1 folder=$2 triple=$3
-  shift 3
-  (
-    cd "firmware/$folder"
-    PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 RUSTFLAGS="" CARGO_TARGET_DIR="$target" \
-      /usr/bin/cargo "$command" --release --locked --target "$triple" -Zbuild-std=core "$@"
-  )
-}
 build() { # folder, triple, linker script and further arguments of the linker
   local folder=$1 triple=$2 flags="-C linker-flavor=ld.lld -C linker=/usr/bin/ld.lld -C link-arg=--gc-sections"
   shift 2
   for argument in "$@"; do flags="$flags -C link-arg=$argument"; done
-  # The flags are for the linker alone: they go to the program, and its dependencies are built once for all.
-  compile rustc "$folder" "$triple" -- $flags
+  (
+    cd "firmware/$folder"
+    # The flags are for the linker alone: they go to the program, and its dependencies are built once for all.
+    PATH="/usr/bin:$PATH" RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 RUSTFLAGS="" CARGO_TARGET_DIR="$target" \
+      /usr/bin/cargo rustc --release --locked --target "$triple" -Zbuild-std=core -- $flags
+  )
 }
 section() { readelf -SW "$1" | awk -v name="$2" '{ sub(/^ *\[ *[0-9]+\]/, "") } $1 == name { print $5 }'; }
 sum() { # file, sections: bytes of them together
@@ -58,10 +52,7 @@ rp2350() {
   # The boot ROM starts nothing without this block within the first 4 kB.
   [ "$(sum "$elf" .start_block)" -gt 0 ]
 }
-case ${1:-all} in
-  rp2350) rp2350; exit 0 ;;
-  check) compile check rp2350 thumbv8m.main-none-eabihf; exit 0 ;;
-esac
+[ "${1:-all}" = rp2350 ] && { rp2350; exit 0; }
 
 build mps2-an386 thumbv7em-none-eabihf -Tmemory.x
 firmware="$target/thumbv7em-none-eabihf/release/cellpos-firmware-mps2-an386"

@@ -17,6 +17,8 @@ import cellpos
 from cellpos import _camera
 from cellpos._camera import pack_header
 
+pytestmark = pytest.mark.alone
+
 
 def test_the_header_on_the_page_is_the_one_that_is_sent():
     page = (ROOT / "docs/camera-socket.md").read_text()

@@ -13,6 +13,8 @@ from test_camera import box  # noqa: F401
 
 import cellpos
 
+pytestmark = pytest.mark.alone
+
 PARTNER = """
 [partner]
 kind = "program"
