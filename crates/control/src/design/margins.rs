@@ -70,13 +70,13 @@ impl Grid {
 
     /// Peaks of |S| and |T| only, on the grid: for searches.
     pub(crate) fn peaks(&self, law: &LinearLaw) -> (f64, f64) {
-        self.points
-            .iter()
-            .fold((0.0_f64, 0.0_f64), |(ms, mt), (_, z, p)| {
-                let l = law.at(*z) * p;
-                let s = (l + 1.0).inv().norm();
-                (ms.max(s), mt.max(s * l.norm()))
-            })
+        let mut squares = (0.0_f64, 0.0_f64);
+        for (_, z, p) in &self.points {
+            let l = law.at(*z) * p;
+            let s = 1.0 / (l + 1.0).norm_sqr();
+            squares = (squares.0.max(s), squares.1.max(s * l.norm_sqr()));
+        }
+        (squares.0.sqrt(), squares.1.sqrt())
     }
 
     pub(crate) fn margins(&self, law: &LinearLaw) -> Margins {

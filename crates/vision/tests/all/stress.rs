@@ -68,7 +68,7 @@ fn hot_pixels_beside(take: impl Fn(usize, usize) -> bool) {
                 profile.as_ref(),
                 snr,
                 &mut random,
-                1500,
+                750,
                 &spoil,
             );
             let bound_px = bound(profile.as_ref(), snr);
