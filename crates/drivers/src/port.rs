@@ -1,5 +1,9 @@
 //! The line to the board.
 
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+
 /// A byte port that never blocks for long.
 pub trait Port: Send {
     /// Name, for messages.
@@ -27,5 +31,41 @@ impl<P: Port + ?Sized> Port for Box<P> {
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
         (**self).read_available(buffer)
+    }
+}
+
+/// A connection to a program's socket, made at once or not at all: a program that takes no connection, and has others waiting, must not
+/// keep the loop. Nothing that is done with the stream blocks.
+///
+/// # Errors
+/// Nobody serves the socket, or its program takes no connection now.
+pub(crate) fn connected(path: &Path) -> std::io::Result<UnixStream> {
+    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    connect(&socket, &SocketAddrUnix::new(path)?)?;
+    Ok(UnixStream::from(socket))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustix::net::{bind, listen};
+    use std::io::ErrorKind;
+
+    #[test]
+    fn a_program_that_takes_no_connection_is_not_waited_for() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("busy.sock");
+        let flags = SocketFlags::CLOEXEC;
+        let busy = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None);
+        let busy = busy.expect("a socket");
+        bind(&busy, &SocketAddrUnix::new(&path).expect("short")).expect("bound");
+        listen(&busy, 1).expect("listening");
+        let (waiting, refused): (Vec<_>, Vec<_>) =
+            (0..5).map(|_| connected(&path)).partition(Result::is_ok);
+        assert!(!waiting.is_empty() && !refused.is_empty());
+        for error in refused.into_iter().filter_map(Result::err) {
+            assert_eq!(error.kind(), ErrorKind::WouldBlock, "{error}");
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! An actuator that another program serves on a Unix socket: the board's protocol (docs/board.md) on a stream.
 
-use crate::port::Port;
+use crate::port::{Port, connected};
 use std::io::{Error, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -16,12 +16,6 @@ pub struct ProgramLine {
     name: String,
     stream: Option<UnixStream>,
     looked: Instant,
-}
-
-fn connected(path: &Path) -> std::io::Result<UnixStream> {
-    let stream = UnixStream::connect(path)?;
-    stream.set_nonblocking(true)?;
-    Ok(stream)
 }
 
 impl ProgramLine {

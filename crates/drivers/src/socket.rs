@@ -3,16 +3,18 @@
 //! If the server disappears, the camera tries to connect again. So a restart of the camera process costs frames, but not the run.
 //! The loop meanwhile sees silence and reacts to it.
 
+use crate::port::connected;
 use cellpos_link::frames::FrameGatherer;
 use cellpos_rig::clock::{Clock, monotonic_ns};
 use cellpos_rig::source::{Camera, CameraError, FrameBuffer, FrameStamp, SourceInfo};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use std::io::{ErrorKind, Read};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Interval between two attempts to find a lost server.
-const RECONNECT_EVERY: Duration = Duration::from_millis(20);
+/// Interval between two attempts to find a lost server, ns: one that takes a connection and ends it must not keep a processor busy.
+const RECONNECT_EVERY_NS: i64 = 20_000_000;
 /// One read: several small frames, or a piece of a large one.
 const CHUNK: usize = 1 << 16;
 
@@ -21,6 +23,8 @@ const CHUNK: usize = 1 << 16;
 pub struct SocketCamera {
     path: PathBuf,
     stream: Option<UnixStream>,
+    /// When a connection was last tried.
+    looked_ns: i64,
     gatherer: FrameGatherer,
     chunk: Vec<u8>,
     /// The part of `chunk` that has not been gathered yet.
@@ -39,7 +43,7 @@ impl SocketCamera {
         latency_ms: f64,
         patience: Duration,
     ) -> Result<Self, CameraError> {
-        let stream = UnixStream::connect(path).map_err(|error| CameraError::Gone {
+        let stream = connected(path).map_err(|error| CameraError::Gone {
             camera: path.display().to_string(),
             problem: format!(
                 "cannot connect: {error}; is the camera server (or firmware-sim) running?"
@@ -48,6 +52,7 @@ impl SocketCamera {
         let mut camera = Self {
             path: path.to_path_buf(),
             stream: Some(stream),
+            looked_ns: monotonic_ns(),
             gatherer: FrameGatherer::new(),
             chunk: vec![0; CHUNK],
             pending: 0..0,
@@ -74,11 +79,17 @@ impl SocketCamera {
         Ok(camera)
     }
 
-    fn reconnect(&mut self) -> bool {
+    /// Tries to find a lost server if it is time to, else waits for that, at most so long.
+    fn reconnect(&mut self, at_most_ns: i64) {
+        let wait_ns = self.looked_ns + RECONNECT_EVERY_NS - monotonic_ns();
+        if wait_ns > 0 {
+            Clock::Real.sleep(Duration::from_nanos(wait_ns.min(at_most_ns) as u64));
+            return;
+        }
+        self.looked_ns = monotonic_ns();
         self.pending = 0..0;
         self.gatherer = FrameGatherer::new();
-        self.stream = UnixStream::connect(&self.path).ok();
-        self.stream.is_some()
+        self.stream = connected(&self.path).ok();
     }
 
     /// Gathers a frame from the bytes at hand.
@@ -123,12 +134,19 @@ impl SocketCamera {
     }
 }
 
-/// Reads the bytes that have arrived, without waiting.
-fn at_hand(stream: &mut UnixStream, chunk: &mut [u8]) -> std::io::Result<usize> {
-    stream.set_nonblocking(true)?;
-    let read = stream.read(chunk);
-    stream.set_nonblocking(false)?;
-    read
+/// Reads the bytes at hand. If there are none, waits for some, but not longer than so many ns.
+fn read_within(stream: &mut UnixStream, chunk: &mut [u8], ns: i64) -> std::io::Result<usize> {
+    match stream.read(chunk) {
+        Err(error) if error.kind() == ErrorKind::WouldBlock && ns > 0 => {
+            let span = Timespec {
+                tv_sec: ns / 1_000_000_000,
+                tv_nsec: ns % 1_000_000_000,
+            };
+            poll(&mut [PollFd::new(stream, PollFlags::IN)], Some(&span))?;
+            stream.read(chunk)
+        }
+        read => read,
+    }
 }
 
 impl Camera for SocketCamera {
@@ -148,25 +166,15 @@ impl Camera for SocketCamera {
                 if overdue {
                     return Ok(None);
                 }
-                if !self.reconnect() {
-                    Clock::Real.sleep(RECONNECT_EVERY.min(Duration::from_nanos(left_ns as u64)));
-                }
+                self.reconnect(left_ns);
                 continue;
             };
-            let read = if overdue {
-                at_hand(stream, &mut self.chunk)
-            } else {
-                let left = Duration::from_nanos(left_ns as u64).max(Duration::from_micros(1));
-                stream
-                    .set_read_timeout(Some(left))
-                    .and_then(|()| stream.read(&mut self.chunk))
-            };
-            match read {
+            match read_within(stream, &mut self.chunk, left_ns) {
                 Ok(0) => self.stream = None,
                 Ok(length) => self.pending = 0..length,
                 Err(error) => match error.kind() {
                     ErrorKind::WouldBlock if overdue => return Ok(None),
-                    ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted => {}
+                    ErrorKind::WouldBlock | ErrorKind::Interrupted => {}
                     _ => self.stream = None,
                 },
             }
@@ -237,6 +245,36 @@ mod tests {
             .expect("a frame");
         assert_eq!((stamp.id, buffer.mono8.as_slice()), (9, &[5; 8][..]));
         server.join().expect("the server ends");
+    }
+
+    #[test]
+    fn a_server_that_ends_each_connection_is_asked_again_at_a_pace() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("camera.sock");
+        let listener = UnixListener::bind(&path).expect("a socket");
+        let server = std::thread::spawn(move || {
+            let (mut client, _) = listener.accept().expect("a client");
+            let mut bytes = header(1, 8).to_bytes().to_vec();
+            bytes.extend([1; 8]);
+            client.write_all(&bytes).expect("the client reads");
+            drop(client);
+            listener.set_nonblocking(true).expect("a socket");
+            let (until_ns, mut clients) = (monotonic_ns() + 400_000_000, 0);
+            while monotonic_ns() < until_ns {
+                clients += usize::from(listener.accept().is_ok());
+                std::thread::sleep(Duration::from_micros(50));
+            }
+            clients
+        });
+        let mut camera = SocketCamera::connect(&path, 1000.0, 2.0, Duration::from_secs(5))
+            .expect("the first frame comes");
+        let mut buffer = FrameBuffer::default();
+        let deadline_ns = monotonic_ns() + 300_000_000;
+        let frame = camera.next_frame(&mut buffer, deadline_ns);
+        assert!(frame.expect("a silent camera").is_none());
+        // One at once, one every 20 ms, and one that the end of the time came between.
+        let clients = server.join().expect("the server ends");
+        assert!((2..=17).contains(&clients), "{clients} connections");
     }
 
     #[test]

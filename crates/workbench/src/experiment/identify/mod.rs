@@ -260,12 +260,16 @@ fn on_rig(
             progress: &mut *progress,
             segment: &mut segment,
         };
-        let acquired = rig
-            .acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut())
-            .map_err(|failure| match kept(job, plan, &records) {
-                Ok(Some(path)) => failure.with_remedy(&resume(&path, plan, &records)),
-                Ok(None) | Err(_) => failure,
-            })?;
+        let acquired = match rig.acquire_shown(plan, &todo, &mut listener, pages.as_deref_mut()) {
+            Ok(acquired) => acquired,
+            Err(failure) => {
+                unfinished(pages, &failure.text(), plan, &records);
+                return Err(match kept(job, plan, &records) {
+                    Ok(Some(path)) => failure.with_remedy(&resume(&path, plan, &records)),
+                    Ok(None) | Err(_) => failure,
+                });
+            }
+        };
         records = joined(&records, &acquired.records);
         again.learn(&acquired, &records);
         if !acquired.records.is_empty() {
@@ -292,13 +296,7 @@ fn on_rig(
                 tracing::warn!("{}; measuring again what is missing", trouble.seen());
             }
             Some(trouble) => {
-                let (done, of) = (records.len(), plan.segments.len());
-                if let Some(pages) = pages {
-                    pages.over(
-                        false,
-                        &format!("{trouble}; {done} of {of} segments are measured."),
-                    );
-                }
+                unfinished(pages, &trouble.to_string(), plan, &records);
                 return Err(stopped(job, plan, &records, &trouble)?);
             }
         }
@@ -320,6 +318,17 @@ fn on_rig(
         warnings,
         runs,
     })
+}
+
+/// Tells the page why there is no further run.
+fn unfinished(pages: Option<&mut Pages>, why: &str, plan: &Plan, records: &[RecordedSegment]) {
+    if let Some(pages) = pages {
+        let (done, of) = (records.len(), plan.segments.len());
+        pages.over(
+            false,
+            &format!("{why}; {done} of {of} segments are measured."),
+        );
+    }
 }
 
 /// Segments of earlier runs and of this one, in order.
