@@ -5,10 +5,13 @@ use crate::config::LocaliserConfig;
 use crate::fix::FixQuality;
 use crate::frame::{Frame, Pixels};
 use crate::localiser::Localiser;
+use cellpos_numeric::Random;
 
 /// Beads of a trial, and the least number to be found.
 const BEADS: usize = 20;
 const FOUND: usize = 18;
+/// Each range is tried with the same beads.
+const SEED: u64 = 1;
 /// Contrast and background of the beads drawn, grey levels.
 const CONTRAST: f32 = 4000.0;
 const BACKGROUND: f32 = 20_000.0;
@@ -106,16 +109,16 @@ impl Trial {
         if side >= 1000 {
             return None;
         }
-        let mut random = Random(0x9E37_79B9_7F4A_7C15);
+        let mut random = Random::new(SEED);
         let middle = 0.5 * (side - 1) as f64;
         let bead = |_| {
-            let place = random.within_a_pixel_of((middle, middle));
+            let place = within_a_pixel(&mut random, (middle, middle));
             let noise = (0..side * side).map(|_| random.normal() as f32).collect();
             Bead {
                 place,
                 noise,
                 // As a loop that expects the bead to within a pixel.
-                guess: random.within_a_pixel_of(place),
+                guess: within_a_pixel(&mut random, place),
             }
         };
         Some(Trial {
@@ -168,25 +171,9 @@ impl Trial {
     }
 }
 
-/// Numbers that are the same each time: xorshift64*.
-struct Random(u64);
-
-impl Random {
-    fn uniform(&mut self) -> f64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    fn within_a_pixel_of(&mut self, (x, y): (f64, f64)) -> (f64, f64) {
-        (x + self.uniform() - 0.5, y + self.uniform() - 0.5)
-    }
-
-    fn normal(&mut self) -> f64 {
-        let r = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-        r * (core::f64::consts::TAU * self.uniform()).cos()
-    }
+/// A place less than half a pixel from another, along each axis.
+fn within_a_pixel(random: &mut Random, (x, y): (f64, f64)) -> (f64, f64) {
+    (x + random.uniform() - 0.5, y + random.uniform() - 0.5)
 }
 
 /// Blurs a square picture with nothing beyond its border by a Gaussian.
