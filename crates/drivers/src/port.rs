@@ -3,6 +3,7 @@
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 /// A byte port that never blocks for long.
 pub trait Port: Send {
@@ -31,6 +32,38 @@ impl<P: Port + ?Sized> Port for Box<P> {
 
     fn read_available(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
         (**self).read_available(buffer)
+    }
+}
+
+/// When a lost peer is looked for again: at a pace, so that one that ends each connection keeps no processor busy, and opening a USB
+/// port, which takes milliseconds, is rare.
+#[derive(Debug)]
+pub(crate) struct Search {
+    last: Instant,
+}
+
+impl Search {
+    pub(crate) const EVERY: Duration = Duration::from_millis(20);
+
+    /// The peer was there just now, or was just looked for.
+    pub(crate) fn begun() -> Self {
+        Self {
+            last: Instant::now(),
+        }
+    }
+
+    /// Time until the peer may be looked for again.
+    pub(crate) fn left(&self) -> Duration {
+        Self::EVERY.saturating_sub(self.last.elapsed())
+    }
+
+    /// Whether it is time to look for the peer, which the caller then does.
+    pub(crate) fn is_due(&mut self) -> bool {
+        let is_due = self.left().is_zero();
+        if is_due {
+            *self = Self::begun();
+        }
+        is_due
     }
 }
 

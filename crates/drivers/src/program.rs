@@ -1,13 +1,9 @@
 //! An actuator that another program serves on a Unix socket: the board's protocol (docs/board.md) on a stream.
 
-use crate::port::{Port, connected};
+use crate::port::{Port, Search, connected};
 use std::io::{Error, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
-
-/// Interval between two attempts to find a program that has gone.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// A connection to a program that serves an actuator. If the program goes and comes back, it connects again.
 #[derive(Debug)]
@@ -15,7 +11,7 @@ pub struct ProgramLine {
     path: PathBuf,
     name: String,
     stream: Option<UnixStream>,
-    looked: Instant,
+    search: Search,
 }
 
 impl ProgramLine {
@@ -28,14 +24,13 @@ impl ProgramLine {
             stream: Some(connected(path)?),
             path: path.to_path_buf(),
             name: path.display().to_string(),
-            looked: Instant::now(),
+            search: Search::begun(),
         })
     }
 
     /// The stream; if the program was gone and is back, a new one.
     fn stream(&mut self) -> std::io::Result<&mut UnixStream> {
-        if self.stream.is_none() && self.looked.elapsed() >= LOOK_EVERY {
-            self.looked = Instant::now();
+        if self.stream.is_none() && self.search.is_due() {
             self.stream = connected(&self.path).ok();
         }
         self.stream.as_mut().ok_or_else(|| {
@@ -89,6 +84,7 @@ impl Port for ProgramLine {
 mod tests {
     use super::*;
     use std::os::unix::net::UnixListener;
+    use std::time::{Duration, Instant};
 
     #[test]
     fn bytes_cross_an_empty_line_reads_nothing_and_a_full_one_takes_nothing() {
@@ -122,10 +118,10 @@ mod tests {
         for _ in 0..2 {
             line.read_available(&mut buffer).expect_err("gone");
             line.write_some(&[1]).expect_err("gone");
-            std::thread::sleep(LOOK_EVERY);
+            std::thread::sleep(Search::EVERY);
         }
         let listener = UnixListener::bind(&path).expect("a socket");
-        std::thread::sleep(LOOK_EVERY);
+        std::thread::sleep(Search::EVERY);
         assert_eq!(line.read_available(&mut buffer).expect("back"), 0);
         let (mut far, _) = listener.accept().expect("a host");
         far.write_all(&[5]).expect("open");

@@ -1,6 +1,6 @@
 //! The PZT board on a serial port (a real one, a USB adapter, or a pseudo-terminal).
 
-use crate::port::Port;
+use crate::port::{Port, Search};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FlockOperation, Mode, OFlags, flock};
 use rustix::io::Errno;
@@ -11,13 +11,10 @@ use rustix::termios::{
 use std::io::{Error, ErrorKind};
 use std::os::fd::OwnedFd;
 use std::path::Path;
-use std::time::{Duration, Instant};
 
 /// Longest wait for a line that accepts nothing, ns: half a period of the loop. So answers that arrive meanwhile are still read
 /// in the period of their command.
 const WAIT_NS: i64 = 500_000;
-/// Interval between two attempts to open a lost line: opening a USB port takes milliseconds.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// An open serial port. If it is unplugged and comes back, it opens again.
 #[derive(Debug)]
@@ -25,7 +22,7 @@ pub struct SerialLine {
     port: Option<OwnedFd>,
     name: String,
     baud: u32,
-    looked: Instant,
+    search: Search,
 }
 
 impl SerialLine {
@@ -38,7 +35,7 @@ impl SerialLine {
             port: Some(open(path, baud)?),
             name: path.to_string(),
             baud,
-            looked: Instant::now(),
+            search: Search::begun(),
         })
     }
 
@@ -54,8 +51,7 @@ impl SerialLine {
 
     /// The port, opened again if it was gone.
     fn port(&mut self) -> std::io::Result<&OwnedFd> {
-        if self.port.is_none() && self.looked.elapsed() >= LOOK_EVERY {
-            self.looked = Instant::now();
+        if self.port.is_none() && self.search.is_due() {
             self.port = open(&self.name, self.baud).ok();
         }
         self.port
@@ -65,7 +61,7 @@ impl SerialLine {
 
     fn gone(&mut self, error: impl Into<Error>) -> Error {
         self.port = None;
-        self.looked = Instant::now();
+        self.search = Search::begun();
         error.into()
     }
 }
@@ -133,6 +129,7 @@ mod tests {
     use rustix::termios::{Action, tcflow};
     use std::os::unix::fs::symlink;
     use std::path::PathBuf;
+    use std::time::{Duration, Instant};
 
     /// The board's end of a pseudo-terminal, in raw mode once the line is open, and the path of the host's.
     fn pair() -> (OwnedFd, String) {

@@ -3,7 +3,7 @@
 //! If the server disappears, the camera tries to connect again. So a restart of the camera process costs frames, but not the run.
 //! The loop meanwhile sees silence and reacts to it.
 
-use crate::port::connected;
+use crate::port::{Search, connected};
 use cellpos_link::frames::FrameGatherer;
 use cellpos_rig::clock::{Clock, monotonic_ns};
 use cellpos_rig::source::{Camera, CameraError, FrameBuffer, FrameStamp, SourceInfo};
@@ -13,8 +13,6 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Interval between two attempts to find a lost server, ns: one that takes a connection and ends it must not keep a processor busy.
-const RECONNECT_EVERY_NS: i64 = 20_000_000;
 /// One read: several small frames, or a piece of a large one.
 const CHUNK: usize = 1 << 16;
 
@@ -23,8 +21,7 @@ const CHUNK: usize = 1 << 16;
 pub struct SocketCamera {
     path: PathBuf,
     stream: Option<UnixStream>,
-    /// When a connection was last tried.
-    looked_ns: i64,
+    search: Search,
     gatherer: FrameGatherer,
     chunk: Vec<u8>,
     /// The part of `chunk` that has not been gathered yet.
@@ -52,7 +49,7 @@ impl SocketCamera {
         let mut camera = Self {
             path: path.to_path_buf(),
             stream: Some(stream),
-            looked_ns: monotonic_ns(),
+            search: Search::begun(),
             gatherer: FrameGatherer::new(),
             chunk: vec![0; CHUNK],
             pending: 0..0,
@@ -79,14 +76,12 @@ impl SocketCamera {
         Ok(camera)
     }
 
-    /// Tries to find a lost server if it is time to, else waits for that, at most so long.
-    fn reconnect(&mut self, at_most_ns: i64) {
-        let wait_ns = self.looked_ns + RECONNECT_EVERY_NS - monotonic_ns();
-        if wait_ns > 0 {
-            Clock::Real.sleep(Duration::from_nanos(wait_ns.min(at_most_ns) as u64));
+    /// Looks for a lost server if it is time to, else waits for that time; `at_most` bounds the wait.
+    fn reconnect(&mut self, at_most: Duration) {
+        if !self.search.is_due() {
+            Clock::Real.sleep(self.search.left().min(at_most));
             return;
         }
-        self.looked_ns = monotonic_ns();
         self.pending = 0..0;
         self.gatherer = FrameGatherer::new();
         self.stream = connected(&self.path).ok();
@@ -134,7 +129,7 @@ impl SocketCamera {
     }
 }
 
-/// Reads the bytes at hand. If there are none, waits for some, but not longer than so many ns.
+/// Reads the bytes at hand. If nothing has arrived, waits for bytes for at most `ns`.
 fn read_within(stream: &mut UnixStream, chunk: &mut [u8], ns: i64) -> std::io::Result<usize> {
     match stream.read(chunk) {
         Err(error) if error.kind() == ErrorKind::WouldBlock && ns > 0 => {
@@ -166,7 +161,7 @@ impl Camera for SocketCamera {
                 if overdue {
                     return Ok(None);
                 }
-                self.reconnect(left_ns);
+                self.reconnect(Duration::from_nanos(left_ns as u64));
                 continue;
             };
             match read_within(stream, &mut self.chunk, left_ns) {
@@ -205,6 +200,13 @@ mod tests {
         }
     }
 
+    /// A frame of 8 bits with one grey value, as it is sent.
+    fn frame(id: u64, grey: u8) -> Vec<u8> {
+        let mut bytes = header(id, 8).to_bytes().to_vec();
+        bytes.extend([grey; 8]);
+        bytes
+    }
+
     #[test]
     fn frames_survive_being_torn_and_a_server_that_comes_back() {
         let directory = tempfile::tempdir().expect("a temporary directory");
@@ -221,9 +223,7 @@ mod tests {
             }
             drop(client);
             let (mut client, _) = listener.accept().expect("the client comes back");
-            let mut bytes = header(9, 8).to_bytes().to_vec();
-            bytes.extend([5; 8]);
-            client.write_all(&bytes).expect("the client reads");
+            client.write_all(&frame(9, 5)).expect("the client reads");
         });
         let mut camera = SocketCamera::connect(&path, 1000.0, 2.0, Duration::from_secs(5))
             .expect("the first frame comes");
@@ -254,9 +254,7 @@ mod tests {
         let listener = UnixListener::bind(&path).expect("a socket");
         let server = std::thread::spawn(move || {
             let (mut client, _) = listener.accept().expect("a client");
-            let mut bytes = header(1, 8).to_bytes().to_vec();
-            bytes.extend([1; 8]);
-            client.write_all(&bytes).expect("the client reads");
+            client.write_all(&frame(1, 1)).expect("the client reads");
             drop(client);
             listener.set_nonblocking(true).expect("a socket");
             let (until_ns, mut clients) = (monotonic_ns() + 400_000_000, 0);
@@ -285,9 +283,9 @@ mod tests {
         let server = std::thread::spawn(move || {
             let (mut client, _) = listener.accept().expect("a client");
             for id in 1..=3 {
-                let mut bytes = header(id, 8).to_bytes().to_vec();
-                bytes.extend([id as u8; 8]);
-                client.write_all(&bytes).expect("the client reads");
+                client
+                    .write_all(&frame(id, id as u8))
+                    .expect("the client reads");
             }
             client
         });
