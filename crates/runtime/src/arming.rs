@@ -1,11 +1,14 @@
 //! The check before the loop is closed: is the plant there, with the sign and roughly the gain of the model?
 //!
 //! The PZT makes a small doublet (up, down, back) about the displacement at which it stood; the bead's frame-to-frame increments are fitted
-//! with `drift + ratio * increments predicted by the model`. Increments, because Brownian motion makes positions a random walk; a doublet,
-//! because it leaves the bead where it was. If the bead is farther from position 0 than the doublet moves it, the first half goes towards
-//! 0. A bead at the border of the view stays in it. Increments near a skipped tick or a late frame answer another pulse: they are left out
-//! as long as enough remain. If the fit refuses the plant, or cannot decide, the pulse is made again and fitted together with the earlier
-//! ones.
+//! with `drift * time + ratio * increments predicted by the model`. Increments, because Brownian motion makes positions a random walk; a
+//! doublet, because it leaves the bead where it was. If the bead is farther from position 0 than the doublet moves it, the first half goes
+//! towards 0. A bead at the border of the view stays in it.
+//!
+//! A frame counts for the time of its exposure, however late it comes, and the frame after a missing one for the time since the one
+//! before: such increments have a variance that grows with their time, as Brownian motion has. Increments near a skipped tick, or near a
+//! command that came late or not at all, answer another pulse: they are left out. While the fit refuses the plant after a disturbance, or
+//! cannot decide, the pulse is made again and fitted together with the earlier ones, until the patience of arming ends.
 
 use crate::life::Refusal;
 use cellpos_control::LoopModel;
@@ -22,7 +25,7 @@ pub struct ArmingConfig {
     pub check: bool,
     /// Good positions in a row before the pulse.
     pub steady_ticks: u32,
-    /// Ticks after which arming ends without a result, because the bead was not steadily seen.
+    /// Ticks after which arming ends without a result: without a bead that is steadily seen, or with pulses that leave a doubt.
     pub patience_ticks: u32,
     /// Height of the doublet, um of PZT. One made longer for the plant's lags has the height that moves the bead as far as this one does
     /// without lags.
@@ -91,7 +94,7 @@ impl GainCheck {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arming {
     config: ArmingConfig,
-    /// Increments that must have been seen.
+    /// Ticks that increments must have covered.
     least: u32,
     /// Ticks in a row without a frame that a steady bead may have.
     most_silent: u32,
@@ -110,29 +113,30 @@ pub struct ArmingState {
     steady: u32,
     /// Ticks since the last position.
     unseen: u32,
+    /// Ticks of the pulses before this one, and of the waits for a steady bead before them.
+    spent: u32,
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
     base_um: f64,
     /// Whether the doublet goes down first.
     down_first: bool,
-    /// The last position, um, and the tick of the pulse at which it came.
-    last: Option<(u32, f64)>,
+    /// The last position, um, and the tick of the pulse, with its fraction, at which it came or was due.
+    last: Option<(f64, f64)>,
     /// Ticks in a row without a frame.
     silent: u32,
-    /// Increments of all pulses, and those that nothing disturbed.
-    all: Sums,
-    calm: Sums,
-    /// Tick of the pulse at which time last did not pass as planned, and how many such ticks it has had.
-    disturbed_at: Option<u32>,
-    disturbances: u32,
-    /// Pulses made again.
-    repeated: u32,
+    /// Increments of all pulses.
+    seen: Sums,
+    /// Tick of the pulse at which a command last did not come into force when it was due.
+    unled_at: Option<u32>,
+    /// Whether time has not passed as planned in this pulse.
+    disturbed: bool,
 }
 
-/// Sums for the fit of a straight line.
+/// Sums for the fit of increments `y` by `drift * time + ratio * x`, each with a variance that grows with its time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Sums {
-    n: f64,
+    count: f64,
+    ticks: f64,
     x: f64,
     y: f64,
     xx: f64,
@@ -141,13 +145,14 @@ struct Sums {
 }
 
 impl Sums {
-    fn add(&mut self, x: f64, y: f64) {
-        self.n += 1.0;
+    fn add(&mut self, ticks: f64, x: f64, y: f64) {
+        self.count += 1.0;
+        self.ticks += ticks;
         self.x += x;
         self.y += y;
-        self.xx += x * x;
-        self.xy += x * y;
-        self.yy += y * y;
+        self.xx += x * x / ticks;
+        self.xy += x * y / ticks;
+        self.yy += y * y / ticks;
     }
 }
 
@@ -160,18 +165,25 @@ impl ArmingState {
 
 /// Ticks in a row without a frame that a steady bead may have where each tick has one.
 const MOST_SILENT: u32 = 3;
-/// Pulses made again at most: a rig that is disturbed every time is not fit to be closed.
-const MOST_REPEATED: u32 = 8;
 /// Ticks without a position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
 const SEARCH_UM: f64 = 0.1;
 
+/// A good position.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fix {
+    /// The position, um.
+    pub position_um: f64,
+    /// Its age beyond the camera path, ticks.
+    pub late_ticks: f64,
+}
+
 /// Input of one tick of arming.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmingInput {
-    /// The position, um, if there is a good one.
-    pub position_um: Option<f64>,
+    /// The position, if there is a good one.
+    pub fix: Option<Fix>,
     /// Whether a new frame came: a camera slower than the loop has none for some ticks.
     pub framed: bool,
     /// Displacement commanded so far, um.
@@ -180,6 +192,8 @@ pub struct ArmingInput {
     pub neutral_um: f64,
     /// Whether time did not pass as planned: ticks were skipped, the frame is late, missing or old, the last command was late.
     pub disturbed: bool,
+    /// Whether the commands came into force when they were due: no tick was skipped, none came late or was lost.
+    pub led: bool,
     /// Periods since the tick before.
     pub steps: u64,
 }
@@ -189,7 +203,7 @@ pub struct ArmingInput {
 pub enum Step {
     /// Hold this displacement, um.
     Command(f64),
-    /// The pulse was disturbed or leaves a doubt; hold this displacement, um, until the bead is steady again.
+    /// The pulse leaves a doubt; hold this displacement, um, until the bead is steady again.
     Again(f64, GainCheck),
     /// The check is over.
     Done(GainCheck),
@@ -197,10 +211,10 @@ pub enum Step {
 
 impl Arming {
     /// Prepares the pulse for a plant seen through a camera path of `camera_delay`, with one fix in `ticks_per_fix` ticks. `model` is the
-    /// plant as the loop sees it. Patience and pulse are longer by the ticks of a fix.
+    /// plant as the loop sees it. The pulse is longer by the ticks of a fix.
     ///
     /// A pulse that is shorter than the plant's lags measures the gain over the lags, and moves the bead little. Such a pulse is made as
-    /// long as the lags, and as high as moves the bead as far as the configured pulse does without lags.
+    /// long as the lags, and as high as moves the bead as far as the configured pulse does without lags. Patience grows with the pulse.
     ///
     /// # Errors
     /// The plant cannot be discretised.
@@ -243,14 +257,15 @@ impl Arming {
         }
         let program_um = doublet(height_um);
         let config = ArmingConfig {
-            patience_ticks: config.patience_ticks.saturating_mul(times),
+            patience_ticks: (config.patience_ticks)
+                .saturating_mul(up.div_ceil(config.pulse_ticks.max(1))),
             pulse_um: height_um,
             pulse_ticks: up,
             ..config
         };
         Ok(Self {
             config,
-            least: up / times,
+            least: up,
             most_silent: MOST_SILENT.saturating_mul(times),
             positions_um: answer_um(&program_um),
             program_um,
@@ -266,20 +281,20 @@ impl Arming {
     /// a bead that moves less than some 2 px a frame for one: 200 um/s at 0.1 um/px, which is a zero flow 0.5 um off.
     pub fn step(&self, state: &mut ArmingState, input: &ArmingInput) -> Step {
         let ArmingInput {
-            position_um,
+            fix,
             command_um,
             neutral_um,
             ..
         } = *input;
         let steps = u32::try_from(input.steps).unwrap_or(u32::MAX);
         state.ticks = state.ticks.saturating_add(steps);
-        state.unseen = match position_um {
+        state.unseen = match fix {
             Some(_) => 0,
             None => state.unseen.saturating_add(steps),
         };
         state.silent = if input.framed { 0 } else { state.silent + 1 };
         let Some(pulse) = state.pulse else {
-            if position_um.is_some() {
+            if fix.is_some() {
                 state.steady += 1;
             } else if input.framed || state.silent > self.most_silent {
                 state.steady = 0;
@@ -289,10 +304,10 @@ impl Arming {
                     return Step::Done(GainCheck::unmeasured(None));
                 }
                 state.pulse = Some(0);
-                state.last = position_um.map(|um| (0, um));
+                state.last = fix.map(|fix| (-fix.late_ticks, fix.position_um));
                 state.base_um = command_um;
                 let reach_um = self.positions_um.iter().copied().fold(0.0, f64::max);
-                state.down_first = position_um.is_some_and(|um| um > reach_um);
+                state.down_first = fix.is_some_and(|fix| fix.position_um > reach_um);
                 let first_um = self.program_um.first().copied().unwrap_or(0.0);
                 return Step::Command(command_um + state.way() * first_um);
             }
@@ -307,24 +322,24 @@ impl Arming {
         };
         let tick = pulse + 1;
         state.pulse = Some(tick);
-        if input.disturbed {
-            state.disturbed_at = Some(tick);
-            state.disturbances += 1;
+        state.disturbed |= input.disturbed;
+        if !input.led {
+            state.unled_at = Some(tick);
         }
         self.take(state, input, tick);
         match self.program_um.get(tick as usize) {
             Some(offset_um) => Step::Command(state.base_um + state.way() * offset_um),
             None => {
-                let verdict = self.judge(state, tick);
-                let doubtful = !verdict.sure || state.disturbances > 0;
-                if verdict.refusal.is_none() || !doubtful || state.repeated >= MOST_REPEATED {
+                let verdict = self.judge(state);
+                let doubtful = !verdict.sure || state.disturbed;
+                let spent = state.spent.saturating_add(state.ticks);
+                if verdict.refusal.is_none() || !doubtful || spent > self.config.patience_ticks {
                     return Step::Done(verdict);
                 }
                 let base_um = state.base_um;
                 *state = ArmingState {
-                    repeated: state.repeated + 1,
-                    all: state.all,
-                    calm: state.calm,
+                    spent,
+                    seen: state.seen,
                     ..ArmingState::default()
                 };
                 Step::Again(base_um, verdict)
@@ -334,58 +349,65 @@ impl Arming {
 
     /// The position of a tick of the pulse.
     fn take(&self, state: &mut ArmingState, input: &ArmingInput, tick: u32) {
-        let Some(now_um) = input.position_um else {
+        let Some(fix) = input.fix else {
             if input.framed {
                 // What comes next may be another bead.
                 state.last = None;
             }
             return;
         };
-        let expected_um = |tick: u32| self.positions_um.get(tick as usize);
-        let last = state.last.replace((tick, now_um));
-        let Some((from, before_um)) = last else {
+        let now = f64::from(tick) - fix.late_ticks;
+        let last = state.last.replace((now, fix.position_um));
+        let Some((from, before_um)) = last.filter(|(from, _)| *from < now) else {
             return;
         };
-        let disturbed = state
-            .disturbed_at
-            .is_some_and(|at| at + self.settling_ticks > from);
-        if let (Some(from_um), Some(to_um)) = (expected_um(from), expected_um(tick)) {
-            let (x, y) = (state.way() * (to_um - from_um), now_um - before_um);
-            state.all.add(x, y);
-            if !disturbed {
-                state.calm.add(x, y);
-            }
+        let unled = (state.unled_at).is_some_and(|at| f64::from(at + self.settling_ticks) > from);
+        if !unled {
+            let expected_um = self.expected_um(now) - self.expected_um(from);
+            (state.seen).add(
+                now - from,
+                state.way() * expected_um,
+                fix.position_um - before_um,
+            );
         }
     }
 
-    /// What the pulses up to a tick of the present one tell: from the increments that nothing disturbed, or from all where those
-    /// are too few.
-    fn judge(&self, state: &ArmingState, tick: u32) -> GainCheck {
-        if let Some(verdict) = self.fitted(&state.calm) {
-            return verdict;
-        }
-        let Some(verdict) = self.fitted(&state.all) else {
-            return GainCheck::unmeasured(Some(Refusal::LostInPulse));
+    /// The position that the model expects at a tick of the pulse and its fraction, less the one before the pulse, um.
+    fn expected_um(&self, tick: f64) -> f64 {
+        let at = |tick: usize| {
+            let last = self.positions_um.last();
+            (self.positions_um.get(tick).or(last)).map_or(0.0, |um| *um)
         };
-        // A path that is always late delays the answer and leaves its size; one that is late now and then may do anything to it.
-        let always = state.disturbances + self.settling_ticks >= tick;
-        match verdict.refusal {
-            Some(_) if !always => GainCheck::unmeasured(Some(Refusal::Disturbed)),
-            _ => verdict,
-        }
+        let whole = tick.max(0.0).floor();
+        let (before_um, after_um) = (at(whole as usize), at(whole as usize + 1));
+        before_um + (tick.max(0.0) - whole) * (after_um - before_um)
+    }
+
+    /// What the pulses tell, by the increments that nothing disturbed.
+    fn judge(&self, state: &ArmingState) -> GainCheck {
+        let missing = if state.disturbed {
+            Refusal::Disturbed
+        } else {
+            Refusal::LostInPulse
+        };
+        let unmeasured = || GainCheck::unmeasured(Some(missing));
+        self.fitted(&state.seen).unwrap_or_else(unmeasured)
     }
 
     /// Straight-line fit of increments; `None` if there are too few.
     fn fitted(&self, s: &Sums) -> Option<GainCheck> {
-        let sxx = s.xx - s.x * s.x / s.n.max(1.0);
-        let sxy = s.xy - s.x * s.y / s.n.max(1.0);
-        let syy = s.yy - s.y * s.y / s.n.max(1.0);
         // Half of a pulse must have been seen, or the ratio means nothing.
-        if s.n < f64::from(self.least) || sxx.is_nan() || sxx <= 0.0 {
+        if s.ticks < f64::from(self.least) || s.count < 3.0 {
+            return None;
+        }
+        let sxx = s.xx - s.x * s.x / s.ticks;
+        let sxy = s.xy - s.x * s.y / s.ticks;
+        let syy = s.yy - s.y * s.y / s.ticks;
+        if sxx.is_nan() || sxx <= 0.0 {
             return None;
         }
         let gain_ratio = sxy / sxx;
-        let dof = (s.n - 2.0).max(1.0);
+        let dof = s.count - 2.0;
         let sd = (((syy - gain_ratio * sxy) / dof).max(0.0) / sxx).sqrt();
         let mut found = GainCheck {
             gain_ratio,

@@ -5,6 +5,19 @@ use super::*;
 const SAMPLE: Seconds = Seconds(1e-3);
 const DELAY: Seconds = Seconds(2e-3);
 
+/// A position that comes when it is due.
+fn due(position_um: f64) -> Fix {
+    Fix {
+        position_um,
+        late_ticks: 0.0,
+    }
+}
+
+/// A reproducible jitter of the position.
+fn jitter_um(tick: u32) -> f64 {
+    0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5)
+}
+
 /// A plant of `factor` times Eq. (6) with drift and a reproducible jitter of the position.
 fn run(config: ArmingConfig, factor: f64, blind: impl Fn(u32) -> bool) -> (GainCheck, f64) {
     let (verdict, largest, _) = run_disturbed(config, factor, blind, |_| 0);
@@ -19,23 +32,31 @@ fn run_disturbed(
     skipped: impl Fn(u32) -> u32,
 ) -> (GainCheck, f64, u32) {
     let seen = |tick: u32, um: f64| {
-        let jitter =
-            0.02 * (f64::from(tick.wrapping_mul(2_654_435_761)) / f64::from(u32::MAX) - 0.5);
-        let position = factor * um + 0.01 * f64::from(tick) + jitter;
-        (!blind(tick)).then_some(position)
+        let position = factor * um + 0.01 * f64::from(tick) + jitter_um(tick);
+        (!blind(tick)).then_some(due(position))
     };
-    arm(config, DELAY, seen, |tick| {
-        (skipped(tick), skipped(tick) > 0)
+    arm(config, DELAY, seen, |tick| Time {
+        skipped: skipped(tick),
+        ..Time::default()
     })
 }
 
-/// Arms Eq. (6) behind a true delay. `seen`: the position that tick makes of the plant's, um; `time`: ticks skipped before
-/// a tick, and whether it is told as disturbed. Gives the verdict, how far the PZT went, um, and the pulses made again.
+/// How a tick comes.
+#[derive(Default)]
+struct Time {
+    /// Ticks skipped before it.
+    skipped: u32,
+    /// Whether its frame comes late or not at all; without, a missing position is one of a frame without a bead.
+    frames_may_fail: bool,
+}
+
+/// Arms Eq. (6) behind a true delay. `seen`: the position that tick makes of the plant's, um. Gives the verdict, how far the PZT went,
+/// um, and the pulses made again.
 fn arm(
     config: ArmingConfig,
     delay: Seconds,
-    mut seen: impl FnMut(u32, f64) -> Option<f64>,
-    time: impl Fn(u32) -> (u32, bool),
+    mut seen: impl FnMut(u32, f64) -> Option<Fix>,
+    time: impl Fn(u32) -> Time,
 ) -> (GainCheck, f64, u32) {
     let arming = Arming::new(
         config,
@@ -53,18 +74,20 @@ fn arm(
     let mut largest: f64 = 0.0;
     let mut again = 0;
     for tick in 0..10_000u32 {
-        let (skipped, disturbed) = time(tick);
+        let time = time(tick);
         // The last command stands while the loop does not run.
-        for _ in 0..skipped {
+        for _ in 0..time.skipped {
             plant.step(&mut truth, command - 20.0);
         }
+        let fix = seen(tick, plant.output_um(&truth));
         let input = ArmingInput {
-            position_um: seen(tick, plant.output_um(&truth)),
-            framed: true,
+            fix,
+            framed: !time.frames_may_fail || fix.is_some(),
             command_um: command,
             neutral_um: 20.0,
-            disturbed,
-            steps: u64::from(skipped) + 1,
+            disturbed: time.skipped > 0 || time.frames_may_fail,
+            led: time.skipped == 0,
+            steps: u64::from(time.skipped) + 1,
         };
         match arming.step(&mut state, &input) {
             Step::Command(next) => command = next,
@@ -96,11 +119,12 @@ fn the_pzt_goes_to_the_believed_rest_where_no_bead_is_seen_and_that_may_be_where
         let mut command = 12.0;
         for tick in 0..1000 {
             let input = ArmingInput {
-                position_um: (then_um.is_some() && tick < 10).then_some(0.0),
+                fix: (then_um.is_some() && tick < 10).then_some(due(0.0)),
                 framed: true,
                 command_um: command,
                 neutral_um: then_um.filter(|_| tick >= 10).unwrap_or(20.0),
                 disturbed: false,
+                led: true,
                 steps: 1,
             };
             let step = arming.step(&mut state, &input);
@@ -192,7 +216,7 @@ fn what_cannot_be_told_for_stalls_is_said_of_the_stalls_and_not_of_the_plant() {
     for factor in [1.0, -1.0, 0.0] {
         let (verdict, _, again) = run_disturbed(config, factor, |_| false, always);
         assert_eq!(verdict.refusal, Some(Refusal::Disturbed), "{verdict:?}");
-        assert_eq!(again, MOST_REPEATED);
+        assert!(again > 0);
     }
     // One stall in every pulse leaves enough of each.
     let now_and_then = |tick| if tick % 23 == 0 { 30 } else { 0 };
@@ -206,22 +230,59 @@ fn what_cannot_be_told_for_stalls_is_said_of_the_stalls_and_not_of_the_plant() {
     }
 }
 
+/// When vision that takes `cost` ticks a frame and always takes the newest gives its positions: for each tick the lateness of the one
+/// that has come by then.
+fn late_ticks(cost: f64) -> Vec<Option<u32>> {
+    let mut late = vec![None; 20_000];
+    let mut free = 0.0_f64;
+    while let Some(slot) = late.get_mut((free + cost).ceil() as usize) {
+        let frame = free.floor();
+        *slot = Some(((free + cost).ceil() - frame) as u32);
+        free = (frame + 1.0).max(free + cost);
+    }
+    late
+}
+
 #[test]
-fn frames_that_are_always_late_are_no_reason_to_refuse_and_hide_no_wrong_plant() {
-    for (factor, refusal) in [
-        (1.0, None),
-        (-1.0, Some(Refusal::WrongSign)),
-        (4.0, Some(Refusal::WrongGain)),
-        (0.0, Some(Refusal::NoResponse)),
-    ] {
-        // Two ticks later than the model says, and told as late.
-        let late = Seconds(DELAY.value() + 2e-3);
-        let seen = |_, um: f64| Some(factor * um);
-        let (verdict, ..) = arm(ArmingConfig::default(), late, seen, |_| (0, true));
-        assert_eq!(verdict.refusal, refusal, "{factor}: {verdict:?}");
+fn frames_that_come_late_or_never_are_no_reason_to_refuse_and_hide_no_wrong_plant() {
+    let always: fn(u32) -> bool = |_| true;
+    let mostly: fn(u32) -> bool = |tick| tick % 13 > 2;
+    let stretch: fn(u32) -> bool = |tick| tick < 700;
+    for slow in [always, mostly, stretch] {
+        for cost in [0.4, 1.3, 2.6, 3.7] {
+            for (factor, refusal) in [
+                (1.0, None),
+                (-1.0, Some(Refusal::WrongSign)),
+                (4.0, Some(Refusal::WrongGain)),
+                (0.0, Some(Refusal::NoResponse)),
+            ] {
+                let late = late_ticks(cost);
+                let mut past_um = vec![];
+                let seen = |tick: u32, um: f64| {
+                    past_um.push(factor * um + 0.01 * f64::from(tick) + jitter_um(tick));
+                    if !slow(tick) {
+                        return Some(due(*past_um.last()?));
+                    }
+                    let late = late.get(tick as usize).copied().flatten()?;
+                    let position_um = *past_um.iter().rev().nth(late as usize)?;
+                    Some(Fix {
+                        position_um,
+                        late_ticks: f64::from(late),
+                    })
+                };
+                let (verdict, ..) = arm(ArmingConfig::default(), DELAY, seen, |tick| Time {
+                    frames_may_fail: slow(tick),
+                    ..Time::default()
+                });
+                assert_eq!(verdict.refusal, refusal, "{cost} {factor}: {verdict:?}");
+                let exact = (verdict.gain_ratio - factor).abs() < 0.02;
+                assert!(exact, "{cost} {factor}: {verdict:?}");
+            }
+        }
     }
 }
 
+#[test]
 #[test]
 fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
     // 0.3 um RMS of white noise: 0.42 um an increment beside the 0.2 um that the pulse makes of it.
@@ -234,9 +295,9 @@ fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
                     f64::from(random) / f64::from(u32::MAX) - 0.5
                 })
                 .sum();
-            Some(factor * um + 0.3 * noise)
+            Some(due(factor * um + 0.3 * noise))
         };
-        let (verdict, _, again) = arm(ArmingConfig::default(), DELAY, seen, |_| (0, false));
+        let (verdict, _, again) = arm(ArmingConfig::default(), DELAY, seen, |_| Time::default());
         (verdict, again)
     };
     let mut most = 0;
@@ -260,9 +321,9 @@ fn the_pulse_takes_a_bead_at_the_border_towards_the_middle_and_back() {
         let seen = |_, um: f64| {
             let position = start_um + um;
             (nearest, farthest) = (nearest.min(position.abs()), farthest.max(position.abs()));
-            Some(position)
+            Some(due(position))
         };
-        let (verdict, ..) = arm(ArmingConfig::default(), DELAY, seen, |_| (0, false));
+        let (verdict, ..) = arm(ArmingConfig::default(), DELAY, seen, |_| Time::default());
         assert_eq!(verdict.refusal, None, "{verdict:?}");
         assert!(farthest < 11.05, "{farthest} um from the middle");
         assert!((8.5..9.5).contains(&nearest), "{nearest} um");
@@ -305,11 +366,12 @@ fn arm_in_brownian_motion(
         farthest = farthest.max(answer_um.abs());
         wander_um += step_um * (0..12).map(|_| uniform()).sum::<f64>();
         let input = ArmingInput {
-            position_um: Some(answer_um + wander_um),
+            fix: Some(due(answer_um + wander_um)),
             framed: true,
             command_um: command,
             neutral_um: 20.0,
             disturbed: false,
+            led: true,
             steps: 1,
         };
         match arming.step(&mut state, &input) {

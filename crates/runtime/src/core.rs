@@ -349,7 +349,8 @@ impl<R: ReferenceGenerator> Core<R> {
             steps: (index - self.state.index).max(1),
             flags: TickFlags::default(),
             events: Events::default(),
-            disturbed: false,
+            frames_disturbed: false,
+            commands_disturbed: false,
         };
         let slew_time_s = if first {
             tick.event(EventKind::Armed);
@@ -377,7 +378,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 self.thaw(FreezeReason::Operator, &mut tick);
             }
         }
-        let mode = self.advance_life(fix.map(|fix| fix.position_um), input.request, &mut tick);
+        let mode = self.advance_life(fix, input.request, &mut tick);
         let moved = self.move_partner(input, mode, &mut tick);
         let (output, generated) =
             self.control(fix, input, mode, (slew_time_s, moved.shift_um), &mut tick);

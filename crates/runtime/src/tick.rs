@@ -143,11 +143,18 @@ pub(crate) struct Tick {
     pub(crate) steps: u64,
     pub(crate) flags: TickFlags,
     pub(crate) events: Events,
-    /// Whether time did not pass as planned up to this tick: ticks skipped, its frame late, missing or old, a late command.
-    pub(crate) disturbed: bool,
+    /// Whether its frame is late, missing or old.
+    pub(crate) frames_disturbed: bool,
+    /// Whether a command did not come into force when it was due: ticks skipped, a command late or lost.
+    pub(crate) commands_disturbed: bool,
 }
 
 impl Tick {
+    /// Whether time did not pass as planned up to this tick.
+    pub(crate) fn disturbed(&self) -> bool {
+        self.frames_disturbed || self.commands_disturbed
+    }
+
     pub(crate) fn event(&mut self, kind: EventKind) {
         self.events.push(Event {
             seq: self.seq,

@@ -266,7 +266,7 @@ impl Clues {
                  design)",
             ),
             Refusal::Disturbed => sentences(
-                "ticks were skipped or frames came late in every arming pulse, so the motion of the bead says nothing about the plant",
+                "ticks were skipped or frames came too late in every arming pulse, so the motion of the bead says nothing about the plant",
                 format!(
                     "half of the {} ticks of a pulse undisturbed",
                     2 * arming.pulse_ticks

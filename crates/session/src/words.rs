@@ -95,7 +95,7 @@ fn refusal(reason: Refusal) -> &'static str {
         Refusal::NoResponse => "the bead did not move with the PZT beyond its own noise",
         Refusal::WrongSign => "the bead moved the wrong way: is the sign in [calibration] right?",
         Refusal::WrongGain => "with this gain the controller may be unstable",
-        Refusal::Disturbed => "ticks were skipped or frames came late in every pulse",
+        Refusal::Disturbed => "ticks were skipped or frames came too late in every pulse",
     }
 }
 

@@ -21,7 +21,7 @@ impl<R: ReferenceGenerator> Core<R> {
         if skipped == 0 {
             return;
         }
-        tick.disturbed = true;
+        tick.commands_disturbed = true;
         tick.event(EventKind::TicksSkipped { count: skipped });
         self.state.counts.skipped += skipped;
         let most = (LONGEST_NS / self.timing.period_ns()).max(1).unsigned_abs();
@@ -90,7 +90,7 @@ impl<R: ReferenceGenerator> Core<R> {
             tick.flags.set(TickFlags::TIMER);
             if input.frames.refused() > 0 && input.frames.backlog == 0 {
                 tick.flags.set(TickFlags::STALE);
-                tick.disturbed = true;
+                tick.frames_disturbed = true;
                 // A stall of this machine makes frames old, not the camera. The camera's path delivers faster than the camera exposes, so
                 // these frames have come when the stall is over for as long as it lasted. The last one may still take `oldest_ms`.
                 // Nor does slow vision: the camera's frames are right, and each that comes too late is one that is missing. Before the
@@ -113,7 +113,7 @@ impl<R: ReferenceGenerator> Core<R> {
         self.state.stale_in_a_row = 0;
         self.state.pictures_repeated = if matches!(m.track, Some((_, Decision::Stale))) {
             tick.flags.set(TickFlags::STALE);
-            tick.disturbed = true;
+            tick.frames_disturbed = true;
             self.state.pictures_repeated.saturating_add(1)
         } else {
             0
@@ -122,7 +122,7 @@ impl<R: ReferenceGenerator> Core<R> {
         let period = self.timing.period_ns();
         let age_ns = input.time_ns - m.mid_exposure_ns;
         let beyond_ns = age_ns - Timing::ms_to_ns(self.timing.camera_delay_ms);
-        tick.disturbed |= beyond_ns > period / 2;
+        tick.frames_disturbed |= beyond_ns > period / 2;
         let early = beyond_ns < -period / 2;
         if early {
             tick.flags.set(TickFlags::EARLY);
@@ -188,7 +188,7 @@ impl<R: ReferenceGenerator> Core<R> {
             });
         }
         if frames.missed > 0 {
-            tick.disturbed = true;
+            tick.frames_disturbed = true;
             tick.flags.set(TickFlags::DROPPED_FRAME);
             tick.event(EventKind::FramesDropped {
                 count: u64::from(frames.missed),
@@ -213,7 +213,7 @@ impl<R: ReferenceGenerator> Core<R> {
     pub(super) fn check_driver(&mut self, input: &TickInput, tick: &mut Tick) {
         match input.previous_late_ns {
             Some(compute_ns) => {
-                tick.disturbed = true;
+                tick.commands_disturbed = true;
                 tick.event(EventKind::LateTick {
                     compute_us: f64::from(compute_ns) * 1e-3,
                 });
@@ -295,10 +295,10 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         if input.command_lost {
             tick.flags.set(TickFlags::COMMAND_LOST);
-            tick.disturbed = true;
+            tick.commands_disturbed = true;
         }
         let refused = input.previous_refused;
-        tick.disturbed |= refused;
+        tick.commands_disturbed |= refused;
         if input.command_lost || refused || holds {
             state.unled = state.unled.saturating_add(1);
         } else {

@@ -1,12 +1,12 @@
 //! The life cycle: armed, running, frozen, safe.
 
 use super::Core;
-use crate::arming::{ArmingInput, ArmingState, Step};
+use crate::arming::{ArmingInput, ArmingState, Fix, Step};
 use crate::life::{EventKind, FreezeReason, Life, Request, SafeReason};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Tick;
 use crate::tick_record::TickFlags;
-use cellpos_control::Mode;
+use cellpos_control::{Measurement, Mode};
 
 /// Frames in a row that show the picture before once more after which the bead is frozen. Shot noise never repeats: one is
 /// already no chance.
@@ -58,7 +58,7 @@ impl<R: ReferenceGenerator> Core<R> {
     /// Life cycle; returns the controller's task.
     pub(super) fn advance_life(
         &mut self,
-        position_um: Option<f64>,
+        fix: Option<Measurement>,
         request: Request,
         tick: &mut Tick,
     ) -> Mode {
@@ -72,11 +72,15 @@ impl<R: ReferenceGenerator> Core<R> {
             let held = self.controller.previous_command_um();
             let neutral_um = self.controller.neutral_um();
             let told = ArmingInput {
-                position_um,
+                fix: fix.map(|fix| Fix {
+                    position_um: fix.position_um,
+                    late_ticks: f64::from(fix.age_samples) + fix.offset_samples,
+                }),
                 framed: !tick.flags.has(TickFlags::TIMER),
                 command_um: held,
                 neutral_um,
-                disturbed: tick.disturbed,
+                disturbed: tick.disturbed(),
+                led: !tick.commands_disturbed,
                 steps: tick.steps,
             };
             match self.arming.step(&mut self.state.arming, &told) {

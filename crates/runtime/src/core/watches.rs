@@ -85,7 +85,7 @@ impl<R: ReferenceGenerator> Core<R> {
             return;
         }
         let on_time = fix.filter(|fix| {
-            !tick.disturbed && fix.age_samples == 0 && fix.offset_samples.abs() < 0.2
+            !tick.disturbed() && fix.age_samples == 0 && fix.offset_samples.abs() < 0.2
         });
         let found = state.following.step(&Seen {
             fix: on_time.map(|fix| (fix.position_um, fix.variance_um2)),
