@@ -3,7 +3,8 @@
 # it on loopback. Asks for root only to install what is missing.
 #   scripts/fake-camera.sh           run the tests
 #   scripts/fake-camera.sh install   install only
-#   scripts/fake-camera.sh build     build the tests, too
+#   scripts/fake-camera.sh shared    run those that may share the machine
+#   scripts/fake-camera.sh alone     run the others, which track a bead or judge times
 #   scripts/fake-camera.sh serve     serve the fake camera on 127.0.0.1 until interrupted, to try cellpos camera
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -31,5 +32,10 @@ if chrt -f 20 true 2>/dev/null; then fifo=(chrt -f 20); else echo "no real-time 
 # The whole workspace, whose features its tests have built: one package alone may have others, and is built anew.
 build=(--locked --workspace --features cellpos-drivers/aravis --test fake_camera)
 cargo test "${build[@]}" --no-run
-[[ ${1:-} == build ]] && exit 0
-"${fifo[@]}" cargo test "${build[@]}" -- --ignored --nocapture --test-threads 1
+timed=a_bead_drawn_into_the_stream
+case ${1:-} in
+    shared) which=(--skip "$timed") ;;
+    alone) which=("$timed") ;;
+    *) which=() ;;
+esac
+"${fifo[@]}" cargo test "${build[@]}" -- --ignored --nocapture --test-threads 1 "${which[@]}"

@@ -7,8 +7,8 @@
 //!
 //! A frame counts for the time of its exposure, however late it comes, and the frame after a missing one for the time since the one
 //! before: such increments have a variance that grows with their time, as Brownian motion has. Increments near a skipped tick, or near a
-//! command that came late or not at all, answer another pulse: they are left out. While the fit refuses the plant after a disturbance, or
-//! cannot decide, the pulse is made again and fitted together with the earlier ones, until the patience of arming ends.
+//! command that came late or not at all, answer another pulse: they are left out. While the fit cannot decide, or refuses the plant after such
+//! a command, the pulse is made again and fitted together with the earlier ones, until the patience of arming ends.
 
 use crate::life::Refusal;
 use cellpos_control::LoopModel;
@@ -113,7 +113,7 @@ pub struct ArmingState {
     steady: u32,
     /// Ticks since the last position.
     unseen: u32,
-    /// Ticks of the pulses before this one, and of the waits for a steady bead before them.
+    /// Ticks of the pulses before this one.
     spent: u32,
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
@@ -331,8 +331,8 @@ impl Arming {
             Some(offset_um) => Step::Command(state.base_um + state.way() * offset_um),
             None => {
                 let verdict = self.judge(state);
-                let doubtful = !verdict.sure || state.disturbed;
-                let spent = state.spent.saturating_add(state.ticks);
+                let doubtful = !verdict.sure || state.unled_at.is_some();
+                let spent = state.spent.saturating_add(tick);
                 if verdict.refusal.is_none() || !doubtful || spent > self.config.patience_ticks {
                     return Step::Done(verdict);
                 }
