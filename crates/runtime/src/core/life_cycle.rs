@@ -68,58 +68,10 @@ impl<R: ReferenceGenerator> Core<R> {
             tick.flags.set(TickFlags::FREEZE);
             return Mode::Freeze;
         }
-        if self.state.life == Life::Armed {
-            let held = self.controller.previous_command_um();
-            let neutral_um = self.controller.neutral_um();
-            let told = ArmingInput {
-                fix: fix.map(|fix| Fix {
-                    position_um: fix.position_um,
-                    late_ticks: f64::from(fix.age_samples) + fix.offset_samples,
-                }),
-                framed: !tick.flags.has(TickFlags::TIMER),
-                command_um: held,
-                neutral_um,
-                disturbed: tick.disturbed(),
-                led: !tick.commands_disturbed,
-                steps: tick.steps,
-            };
-            match self.arming.step(&mut self.state.arming, &told) {
-                Step::Command(command_um) => return Mode::Direct(command_um),
-                Step::Again(command_um, verdict) => {
-                    if let Some(refusal) = verdict.refusal {
-                        tick.event(EventKind::ArmingRepeated {
-                            refusal,
-                            gain_ratio: verdict.gain_ratio,
-                            ci95: verdict.ci95(),
-                        });
-                    }
-                    return Mode::Direct(command_um);
-                }
-                Step::Done(verdict) => match verdict.refusal {
-                    Some(refusal) => {
-                        tick.event(EventKind::ArmingRefused {
-                            refusal,
-                            gain_ratio: verdict.gain_ratio,
-                            ci95: verdict.ci95(),
-                        });
-                        self.latch(SafeReason::ArmingRefused, tick);
-                    }
-                    None => {
-                        self.controller
-                            .start_estimate(verdict.gain_ratio, verdict.sd, verdict.dof);
-                        if verdict.gain_ratio.is_finite() {
-                            tick.event(EventKind::ArmingPassed {
-                                gain_ratio: verdict.gain_ratio,
-                                ci95: verdict.ci95(),
-                            });
-                        }
-                        tick.event(EventKind::Running);
-                        self.state.life = Life::Running;
-                        self.state.running_since = tick.index;
-                        (self.state.blind, self.state.missing) = (0, 0);
-                    }
-                },
-            }
+        if self.state.life == Life::Armed
+            && let Some(mode) = self.arm(fix, tick)
+        {
+            return mode;
         }
         if self.state.life == Life::Running {
             if self.state.pictures_repeated >= REPEATED_PICTURES {
@@ -167,6 +119,62 @@ impl<R: ReferenceGenerator> Core<R> {
             }
             _ => Mode::Park,
         }
+    }
+
+    /// A tick of the check before the loop is closed: the controller's task, unless the check is over.
+    fn arm(&mut self, fix: Option<Measurement>, tick: &mut Tick) -> Option<Mode> {
+        let held = self.controller.previous_command_um();
+        let neutral_um = self.controller.neutral_um();
+        let told = ArmingInput {
+            fix: fix.map(|fix| Fix {
+                position_um: fix.position_um,
+                late_ticks: f64::from(fix.age_samples) + fix.offset_samples,
+            }),
+            framed: !tick.flags.has(TickFlags::TIMER),
+            command_um: held,
+            neutral_um,
+            disturbed: tick.disturbed(),
+            led: !tick.commands_disturbed,
+            steps: tick.steps,
+        };
+        match self.arming.step(&mut self.state.arming, &told) {
+            Step::Command(command_um) => return Some(Mode::Direct(command_um)),
+            Step::Again(command_um, verdict) => {
+                if let Some(refusal) = verdict.refusal {
+                    tick.event(EventKind::ArmingRepeated {
+                        refusal,
+                        gain_ratio: verdict.gain_ratio,
+                        ci95: verdict.ci95(),
+                    });
+                }
+                return Some(Mode::Direct(command_um));
+            }
+            Step::Done(verdict) => match verdict.refusal {
+                Some(refusal) => {
+                    tick.event(EventKind::ArmingRefused {
+                        refusal,
+                        gain_ratio: verdict.gain_ratio,
+                        ci95: verdict.ci95(),
+                    });
+                    self.latch(SafeReason::ArmingRefused, tick);
+                }
+                None => {
+                    self.controller
+                        .start_estimate(verdict.gain_ratio, verdict.sd, verdict.dof);
+                    if verdict.gain_ratio.is_finite() {
+                        tick.event(EventKind::ArmingPassed {
+                            gain_ratio: verdict.gain_ratio,
+                            ci95: verdict.ci95(),
+                        });
+                    }
+                    tick.event(EventKind::Running);
+                    self.state.life = Life::Running;
+                    self.state.running_since = tick.index;
+                    (self.state.blind, self.state.missing) = (0, 0);
+                }
+            },
+        }
+        None
     }
 
     pub(super) fn latch(&mut self, reason: SafeReason, tick: &mut Tick) {
