@@ -283,7 +283,6 @@ fn frames_that_come_late_or_never_are_no_reason_to_refuse_and_hide_no_wrong_plan
 }
 
 #[test]
-#[test]
 fn a_bead_that_jitters_too_much_for_one_pulse_is_told_by_several() {
     // 0.3 um RMS of white noise: 0.42 um an increment beside the 0.2 um that the pulse makes of it.
     let told = |factor: f64, seed: u32| {
