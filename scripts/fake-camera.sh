@@ -3,6 +3,7 @@
 # it on loopback. Asks for root only to install what is missing.
 #   scripts/fake-camera.sh           run the tests
 #   scripts/fake-camera.sh install   install only
+#   scripts/fake-camera.sh build     build the tests, too
 #   scripts/fake-camera.sh shared    run those that may share the machine
 #   scripts/fake-camera.sh alone     run the others, which track a bead or judge times
 #   scripts/fake-camera.sh serve     serve the fake camera on 127.0.0.1 until interrupted, to try cellpos camera
@@ -34,6 +35,7 @@ build=(--locked --workspace --features cellpos-drivers/aravis --test fake_camera
 cargo test "${build[@]}" --no-run
 timed=a_bead_drawn_into_the_stream
 case ${1:-} in
+    build) exit 0 ;;
     shared) which=(--skip "$timed") ;;
     alone) which=("$timed") ;;
     *) which=() ;;
