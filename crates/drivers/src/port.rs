@@ -35,7 +35,7 @@ impl<P: Port + ?Sized> Port for Box<P> {
     }
 }
 
-/// When a lost peer is looked for again: at a pace, so that one that ends each connection keeps no processor busy, and opening a USB
+/// When a lost peer is looked for again: at a pace. A peer that ends each connection then keeps no processor busy, and opening a USB
 /// port, which takes milliseconds, is rare.
 #[derive(Debug)]
 pub(crate) struct Search {

@@ -5,10 +5,10 @@
 //! doublet, because it leaves the bead where it was. If the bead is farther from position 0 than the doublet moves it, the first half goes
 //! towards 0. A bead at the border of the view stays in it.
 //!
-//! A frame counts for the time of its exposure, however late it comes, and the frame after a missing one for the time since the one
-//! before: such increments have a variance that grows with their time, as Brownian motion has. Increments near a skipped tick, or near a
-//! command that came late or not at all, answer another pulse: they are left out. While the fit cannot decide, or refuses the plant after such
-//! a command, the pulse is made again and fitted together with the earlier ones, until the patience of arming ends.
+//! A frame counts for the time of its exposure, however late it comes. The frame after a missing one counts for the time since the one
+//! before. The variance of an increment grows with its time, as Brownian motion's does. Increments near a skipped tick, or near a command
+//! that came late or not at all, answer another pulse: they are left out. While the fit cannot decide, or refuses the plant after such a
+//! command, the pulse is made again. All pulses are fitted together, until the patience of arming ends.
 
 use crate::life::Refusal;
 use cellpos_control::LoopModel;
@@ -385,13 +385,13 @@ impl Arming {
 
     /// What the pulses tell, by the increments that nothing disturbed.
     fn judge(&self, state: &ArmingState) -> GainCheck {
-        let missing = if state.disturbed {
-            Refusal::Disturbed
-        } else {
-            Refusal::LostInPulse
-        };
-        let unmeasured = || GainCheck::unmeasured(Some(missing));
-        self.fitted(&state.seen).unwrap_or_else(unmeasured)
+        self.fitted(&state.seen).unwrap_or_else(|| {
+            GainCheck::unmeasured(Some(if state.disturbed {
+                Refusal::Disturbed
+            } else {
+                Refusal::LostInPulse
+            }))
+        })
     }
 
     /// Straight-line fit of increments; `None` if there are too few.

@@ -5,6 +5,13 @@ use super::*;
 const SAMPLE: Seconds = Seconds(1e-3);
 const DELAY: Seconds = Seconds(2e-3);
 
+/// The check of Eq. (6) behind the camera path of these tests.
+fn arming_of_eq6(config: ArmingConfig) -> Arming {
+    let model = LoopModel::eq6(2e-3);
+    let arming = Arming::new(config, &TransferFunction::eq6(), &model, DELAY, 1.0);
+    arming.expect("eq6 is a plant")
+}
+
 /// A position that comes when it is due.
 fn due(position_um: f64) -> Fix {
     Fix {
@@ -58,14 +65,7 @@ fn arm(
     mut seen: impl FnMut(u32, f64) -> Option<Fix>,
     time: impl Fn(u32) -> Time,
 ) -> (GainCheck, f64, u32) {
-    let arming = Arming::new(
-        config,
-        &TransferFunction::eq6(),
-        &LoopModel::eq6(2e-3),
-        DELAY,
-        1.0,
-    )
-    .expect("eq6 is a plant");
+    let arming = arming_of_eq6(config);
     let plant =
         DiscretePlant::new(&TransferFunction::eq6(), SAMPLE, delay).expect("eq6 is a plant");
     let mut truth = plant.state(0.0);
@@ -105,14 +105,7 @@ fn arm(
 
 #[test]
 fn the_pzt_goes_to_the_believed_rest_where_no_bead_is_seen_and_that_may_be_where_it_stands() {
-    let arming = Arming::new(
-        ArmingConfig::default(),
-        &TransferFunction::eq6(),
-        &LoopModel::eq6(2e-3),
-        DELAY,
-        1.0,
-    )
-    .expect("eq6 is a plant");
+    let arming = arming_of_eq6(ArmingConfig::default());
     // From the start no bead; or one for ten ticks, which moves the belief to `then_um`.
     let stands = |then_um: Option<f64>| {
         let mut state = ArmingState::default();
@@ -216,7 +209,7 @@ fn what_cannot_be_told_for_stalls_is_said_of_the_stalls_and_not_of_the_plant() {
     for factor in [1.0, -1.0, 0.0] {
         let (verdict, _, again) = run_disturbed(config, factor, |_| false, always);
         assert_eq!(verdict.refusal, Some(Refusal::Disturbed), "{verdict:?}");
-        assert!(again > 0);
+        assert_eq!(again, patience_pulses(config));
     }
     // One stall in every pulse leaves enough of each.
     let now_and_then = |tick| if tick % 23 == 0 { 30 } else { 0 };
@@ -230,8 +223,13 @@ fn what_cannot_be_told_for_stalls_is_said_of_the_stalls_and_not_of_the_plant() {
     }
 }
 
-/// When vision that takes `cost` ticks a frame and always takes the newest gives its positions: for each tick the lateness of the one
-/// that has come by then.
+/// Pulses that patience has room for.
+fn patience_pulses(config: ArmingConfig) -> u32 {
+    let arming = arming_of_eq6(config);
+    arming.config.patience_ticks / arming.program_um.len() as u32
+}
+
+/// How late a position comes in each tick, if one comes. Vision takes `cost` ticks for a frame, and then the newest.
 fn late_ticks(cost: f64) -> Vec<Option<u32>> {
     let mut late = vec![None; 20_000];
     let mut free = 0.0_f64;
@@ -279,6 +277,25 @@ fn frames_that_come_late_or_never_are_no_reason_to_refuse_and_hide_no_wrong_plan
                 assert!(exact, "{cost} {factor}: {verdict:?}");
             }
         }
+    }
+}
+
+#[test]
+fn frames_that_are_always_late_are_no_reason_to_refuse_and_hide_no_wrong_plant() {
+    for (factor, refusal) in [
+        (1.0, None),
+        (-1.0, Some(Refusal::WrongSign)),
+        (4.0, Some(Refusal::WrongGain)),
+        (0.0, Some(Refusal::NoResponse)),
+    ] {
+        // Two ticks later than the model says, told as late, by an age that nobody knows.
+        let late = Seconds(DELAY.value() + 2e-3);
+        let seen = |_, um: f64| Some(due(factor * um));
+        let (verdict, ..) = arm(ArmingConfig::default(), late, seen, |_| Time {
+            frames_may_fail: true,
+            ..Time::default()
+        });
+        assert_eq!(verdict.refusal, refusal, "{factor}: {verdict:?}");
     }
 }
 
