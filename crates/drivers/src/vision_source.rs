@@ -74,6 +74,7 @@ impl Followed {
         }
     }
 
+    /// The object in a frame; [`Followed::look_beside`] looks at what else is there.
     fn step(
         &mut self,
         frame: &Frame,
@@ -81,11 +82,22 @@ impl Followed {
         commanded: Commanded,
     ) -> Result<(TrackStep, Option<Cell>), cellpos_vision::CellError> {
         match self {
-            Self::Bead(tracker) => Ok((tracker.step(Some(frame), time_s, commanded), None)),
+            Self::Bead(tracker) => {
+                let step = tracker.step_at_once(Some(frame), time_s, commanded);
+                Ok((step, None))
+            }
             Self::Cell(tracker) => {
                 let step = tracker.step(Some(frame), time_s, commanded)?;
                 Ok((step.track, step.cell))
             }
+        }
+    }
+
+    /// Looks at what else is in the last frame, if that is due; whether it was.
+    fn look_beside(&mut self, frame: &Frame) -> bool {
+        match self {
+            Self::Bead(tracker) => tracker.look_beside(frame),
+            Self::Cell(_) => false,
         }
     }
 }
@@ -246,6 +258,14 @@ impl<C: Camera> VisionSource<C> {
         Ok(seen)
     }
 
+    /// Looks at what else is in the frame in the buffer, whose position has been given.
+    fn look_beside(&mut self) {
+        let from_ns = self.clock.now_ns();
+        if self.followed.look_beside(&self.buffer.frame()) {
+            self.look_ns += self.clock.now_ns() - from_ns;
+        }
+    }
+
     /// The next frame, in the buffer; the one before it goes to `before`. `None` if none came in time.
     fn take(&mut self, deadline_ns: i64) -> Result<Option<FrameStamp>, CameraError> {
         std::mem::swap(&mut self.buffer, &mut self.before);
@@ -295,6 +315,7 @@ impl<C: Camera> VisionSource<C> {
 
 impl<C: Camera> PositionSource for VisionSource<C> {
     fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError> {
+        self.look_beside();
         let Some(stamp) = self.take(deadline_ns)? else {
             return Ok(None);
         };

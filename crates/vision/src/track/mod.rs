@@ -23,7 +23,7 @@ use crate::detector::Detector;
 use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::localiser::Localiser;
-use beside::Beside;
+use beside::{Beside, Owed};
 pub use cell::{CellStep, CellTracker};
 pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;
@@ -69,6 +69,8 @@ pub struct Tracker {
     candidates: [Option<Candidate>; MAX_BEADS],
     /// What else was seen when the chosen bead was last taken among others.
     beside: Beside,
+    /// A look beside the bead, which was taken without it.
+    owed: Option<Owed>,
     /// Share of what may be that the last fixes have used, and whether the end is near.
     used: f64,
     near_limit: bool,
@@ -96,6 +98,7 @@ impl Tracker {
             exposure_s: 0.0,
             candidates: [None; MAX_BEADS],
             beside: Beside::default(),
+            owed: None,
             used: 0.0,
             near_limit: false,
         })
@@ -118,6 +121,7 @@ impl Tracker {
         self.chosen = None;
         self.neighbours = Neighbours::default();
         self.beside = Beside::default();
+        self.owed = None;
         self.standing.state = TrackState::Searching;
     }
 
@@ -129,6 +133,24 @@ impl Tracker {
         time_s: f64,
         commanded: impl Into<Commanded>,
     ) -> TrackStep {
+        let step = self.step_at_once(frame, time_s, commanded);
+        if let Some(frame) = frame {
+            self.look_beside(frame);
+        }
+        TrackStep {
+            neighbours: self.neighbours.count() as u8,
+            ..step
+        }
+    }
+
+    /// As [`Tracker::step`], but leaves to [`Tracker::look_beside`] what this fix does not need, for whom the fix is urgent.
+    pub fn step_at_once(
+        &mut self,
+        frame: Option<&Frame>,
+        time_s: f64,
+        commanded: impl Into<Commanded>,
+    ) -> TrackStep {
+        self.owed = None;
         let Commanded {
             flow_px_per_s,
             streak_px,
@@ -184,7 +206,7 @@ impl Tracker {
     }
 
     fn search(&mut self, frame: &Frame, time_s: f64) -> (Decision, Option<Fix>) {
-        self.look_around(frame, false);
+        self.look_around(frame, false, None);
         let aim = self.aim;
         let distance = |c: &Candidate| match aim {
             Some((x, y)) => f64::hypot(c.fix.x_px - x, c.fix.y_px - y),
@@ -220,7 +242,7 @@ impl Tracker {
         mut chosen: Chosen,
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
-        self.look_around(frame, false);
+        self.look_around(frame, false, None);
         let (mut fix, mut size) = (Fix::none(0.0, 0.0, FixQuality::NoSignal), None);
         let away = |c: &&Candidate| chosen.motion.distance2(&c.fix);
         let seen = self.candidates.iter().flatten();
@@ -250,9 +272,7 @@ impl Tracker {
 
     fn follow(&mut self, frame: &Frame, chosen: Chosen, time_s: f64) -> (Decision, Option<Fix>) {
         let tracking = self.standing.state == TrackState::Tracking;
-        let look =
-            self.frames.is_multiple_of(self.config.neighbour_stride) || self.neighbours.count() > 0;
-        if tracking && !look {
+        if tracking && self.neighbours.count() == 0 {
             let fix = self.localiser.locate(frame, Some(chosen.motion.position()));
             let size = if self.frames.is_multiple_of(SIZE_STRIDE) {
                 self.localiser.relative_size(&fix)
@@ -261,6 +281,9 @@ impl Tracker {
             };
             let candidate = Candidate::new(fix, size);
             if self.is_predicted(&chosen, &candidate) {
+                if self.frames.is_multiple_of(self.config.neighbour_stride) {
+                    self.owed = Some(Owed::new(chosen.motion, candidate, time_s));
+                }
                 self.take(chosen, &candidate, time_s);
                 return (Decision::Accepted, Some(fix));
             }
@@ -275,13 +298,13 @@ impl Tracker {
         chosen: Chosen,
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
-        let all_seen = self.look_around(frame, false);
+        let all_seen = self.look_around(frame, false, None);
         // One that is where it was predicted was carried nowhere, unless another one may have come there.
         let mut seen = self.candidates.iter().flatten();
         let quiet = self.neighbours.count() == 0 && seen.any(|c| self.is_predicted(&chosen, c));
         if !quiet {
             if !all_seen {
-                self.look_around(frame, true);
+                self.look_around(frame, true, None);
             }
             self.look_at_prediction(frame, &chosen);
             self.fit_as_carried(frame, &chosen);

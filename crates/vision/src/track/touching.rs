@@ -16,8 +16,14 @@ type Starts = [Start; MOST_TOGETHER];
 
 impl Tracker {
     /// Locates every bead that the detector sees, those near each other together; with `carried` also as a step of the flow draws
-    /// them out that has carried the chosen bead to one of them. Whether all that are near each other were beads.
-    pub(super) fn look_around(&mut self, frame: &Frame, carried: bool) -> bool {
+    /// them out that has carried the chosen bead to one of them. One that is `known` and stands alone is not located again. Whether
+    /// all that are near each other were beads.
+    pub(super) fn look_around(
+        &mut self,
+        frame: &Frame,
+        carried: bool,
+        known: Option<&Candidate>,
+    ) -> bool {
         self.candidates = [None; MAX_BEADS];
         self.detector.detect(frame);
         let (mut seen, mut count) = ([(0.0, 0.0); MAX_BEADS], 0);
@@ -50,13 +56,19 @@ impl Tracker {
                 }
                 all_seen = false;
             }
-            let fix = self.localiser.locate(frame, Some(seen[k]));
-            let relative_size = self.localiser.relative_size(&fix);
-            self.add_candidate(Candidate {
-                fix,
-                size: relative_size,
-                seen_px: seen[k],
-            });
+            let (x, y) = seen[k];
+            let is_it = |c: &&Candidate| f64::hypot(c.fix.x_px - x, c.fix.y_px - y) < radius_px;
+            let candidate = if let Some(known) = known.filter(is_it) {
+                *known
+            } else {
+                let fix = self.localiser.locate(frame, Some(seen[k]));
+                Candidate {
+                    size: self.localiser.relative_size(&fix),
+                    seen_px: seen[k],
+                    fix,
+                }
+            };
+            self.add_candidate(candidate);
         }
         all_seen
     }

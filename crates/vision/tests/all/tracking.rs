@@ -326,3 +326,28 @@ fn the_bead_nearest_to_the_aim_is_chosen() {
         assert_eq!(tracker.state(), TrackState::Tracking);
     }
 }
+
+#[test]
+fn a_fix_waits_for_no_look_at_what_else_is_there_and_the_look_finds_it() {
+    let (mut random, mut scene) = (Random(11), Scene::new());
+    let (mut at_once, mut whole) = (tracker(), tracker());
+    let mut looks = 0;
+    for n in 0..100 {
+        let time_s = f64::from(n) * DT_S;
+        // The other bead comes when the first one is followed.
+        let beads = [(40.0, 30.0, 1.0), (75.0, 40.0, 1.0)];
+        let frame = scene.draw(&beads[..if n < 30 { 1 } else { 2 }], &mut random);
+        let mut first = at_once.step_at_once(Some(&frame), time_s, (0.0, 0.0));
+        let all = whole.step(Some(&frame), time_s, (0.0, 0.0));
+        if at_once.look_beside(&frame) {
+            looks += 1;
+            assert_eq!(first.neighbours, 0, "frame {n}: the fix waited for the look");
+            first.neighbours = all.neighbours;
+        }
+        assert!(!at_once.look_beside(&frame), "frame {n}: a look is owed once");
+        // As text: what is not known is no number.
+        assert_eq!(format!("{first:?}"), format!("{all:?}"), "frame {n}");
+        assert_eq!(all.neighbours > 0, n >= 39, "frame {n}: {all:?}");
+    }
+    assert_eq!(looks, 2);
+}
