@@ -341,10 +341,16 @@ fn a_fix_waits_for_no_look_at_what_else_is_there_and_the_look_finds_it() {
         let all = whole.step(Some(&frame), time_s, (0.0, 0.0));
         if at_once.look_beside(&frame) {
             looks += 1;
-            assert_eq!(first.neighbours, 0, "frame {n}: the fix waited for the look");
+            assert_eq!(
+                first.neighbours, 0,
+                "frame {n}: the fix waited for the look"
+            );
             first.neighbours = all.neighbours;
         }
-        assert!(!at_once.look_beside(&frame), "frame {n}: a look is owed once");
+        assert!(
+            !at_once.look_beside(&frame),
+            "frame {n}: a look is owed once"
+        );
         // As text: what is not known is no number.
         assert_eq!(format!("{first:?}"), format!("{all:?}"), "frame {n}");
         assert_eq!(all.neighbours > 0, n >= 39, "frame {n}: {all:?}");

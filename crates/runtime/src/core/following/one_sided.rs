@@ -40,13 +40,14 @@ struct Side {
 }
 
 impl Side {
-    /// Gain over the model's, as small as it may be.
+    /// Gain over the model's, as small as it may be, and none above the model's: a tick whose dither moves the bead by next to nothing may
+    /// seem to show any gain, and what it makes of the next tick would outweigh all others.
     fn least_gain(&self, spread_um2: f64) -> f64 {
         if self.dithered_um2 <= 0.0 {
             return 0.0;
         }
-        let sd = (spread_um2 / self.dithered_um2).sqrt();
-        (self.moved_um2 / self.dithered_um2 - DOUBT * sd).max(0.0)
+        let doubt_um2 = DOUBT * (spread_um2 * self.dithered_um2).sqrt();
+        ((self.moved_um2 - doubt_um2) / self.dithered_um2).clamp(0.0, 1.0)
     }
 }
 

@@ -282,6 +282,27 @@ fn an_actuator_that_follows_on_one_side_only_is_told_from_the_dither() {
 }
 
 #[test]
+fn fixes_of_any_age_leave_no_side_without_an_answer() {
+    for rate_hz in [1000.0, 5000.0] {
+        // Of the first command with a dither, a fix that is little less than a whole number of ticks old shows next to nothing.
+        for part in [0.02, 0.5, 0.97, 0.999, 1.0 - 1e-9] {
+            for seed in 1..=60 {
+                let found = found_by(&World {
+                    seed,
+                    rate_hz,
+                    late_s: 2e-3 + part / rate_hz,
+                    // As it moves the bead when the gain has to be learnt, in a tick of any length.
+                    dither_um: 2.0 * DITHER_UM * rate_hz / 1e3,
+                    seconds: 2.0,
+                    ..World::default()
+                });
+                assert_eq!(found, None, "{part} of a tick, {rate_hz} Hz, seed {seed}");
+            }
+        }
+    }
+}
+
+#[test]
 fn flows_that_pulse_one_way_leave_no_side_without_an_answer() {
     let strokes = |t: f64| 20.0 + 1.5 * (-(t * 1.4).fract() / 0.05).exp();
     let hum = |t: f64| 20.0 + 0.5 * (std::f64::consts::TAU * 50.0 * t).sin();
