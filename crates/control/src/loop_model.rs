@@ -151,6 +151,9 @@ const LEAST_GAIN_PER_S: f64 = 1e-6;
 /// Motion by one mode in a sample for 1 um of command, um. Two poles that lie close together have large residues of opposite signs; beyond
 /// this, rounding is all that is left of their difference.
 const MOST_RESIDUE_UM: f64 = 1e9;
+/// A mode whose time constant is shorter than this part of a sample has settled at once: its static part joins the feedthrough. The time
+/// of the command is off by less than that. A fit leaves such a pole anywhere beyond the band, with a residue that grows with it.
+const SETTLED_SAMPLES: f64 = 1e-3;
 /// Poles slower than this count as integrators, rad/s: the drift state takes up what they lack.
 const SLOWEST_RAD_PER_S: f64 = 0.5;
 
@@ -188,6 +191,8 @@ impl LoopModel {
             if pole.abs() <= SLOWEST_RAD_PER_S {
                 integrators += 1;
                 this.gain_per_s += residue;
+            } else if -pole * sample_time_s * SETTLED_SAMPLES > 1.0 {
+                this.feedthrough -= residue / pole;
             } else {
                 modes.push(LoopMode {
                     pole_rad_per_s: pole,

@@ -65,6 +65,8 @@ pub enum NotKept {
     OutOfSight,
     /// It did not follow the commands beyond a level: the actuator is clipped.
     Clipped,
+    /// The loop had frozen it when the run ended, for a reason that would have ended the run had it lasted.
+    Frozen,
     /// It was further from its reference, and for longer, than a loop that holds it lets it.
     Strayed,
 }
@@ -261,7 +263,7 @@ impl KeepWatch {
         self.blind_over(self.last_ns);
         self.gap = Gap::default();
         (self.seen, self.still, self.between) = (None, None, 0);
-        self.adrift = None;
+        (self.adrift, self.frozen_since_ns) = (None, None);
         (self.outside, self.away) = (0.0, false);
     }
 
@@ -451,12 +453,15 @@ impl KeepWatch {
         let unseen_ns = self
             .blind_since_ns
             .map_or(0, |since_ns| self.last_ns - since_ns);
+        let frozen = self.frozen_since_ns.is_some();
         let why = if self.other_beads > 0 {
             Some(NotKept::AnotherBead)
-        } else if self.frozen_since_ns.is_some() && self.blind_since_ns.is_some() {
+        } else if frozen && self.blind_since_ns.is_some() {
             Some(NotKept::OutOfSight)
         } else if self.clipped {
             Some(NotKept::Clipped)
+        } else if frozen {
+            Some(NotKept::Frozen)
         } else {
             (self.strayed > 0).then_some(NotKept::Strayed)
         };

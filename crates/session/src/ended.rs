@@ -441,6 +441,11 @@ fn not_kept(kept: &Kept, clipped_um: Option<f64>) -> Sentences {
             "check the camera (cellpos camera), and bring a bead into view",
         ),
         Some(NotKept::Clipped) => clipped(clipped_um),
+        Some(NotKept::Frozen) => sentences(
+            "the loop had frozen the bead when the run ended".to_owned(),
+            "a bead that the loop controls to the end",
+            "look at the last events (cellpos report): they name the reason",
+        ),
         Some(NotKept::Strayed) | None => sentences(
             format!(
                 "the bead strayed {}, up to {:.2} um from its reference{held}",

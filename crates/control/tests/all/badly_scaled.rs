@@ -118,6 +118,28 @@ fn poles_that_rounding_tears_apart_end_in_a_design_or_a_sentence() {
     assert!(ended.is_some());
 }
 
+/// What a fit makes of a delay that it has no other place for: a zero to the right, and a pole and a zero beyond every band.
+#[test]
+fn a_pole_beyond_every_band_is_settled_at_once_and_gets_a_loop() {
+    let (gain, zero) = (396.0, 4200.0);
+    for pole in [1e7, 1e9, 4.7e11] {
+        let num = vec![-1e-4 * gain / zero, -gain / zero * pole, gain * pole];
+        let plant = DesignPlant {
+            plant: TransferFunction::new(num, vec![1.0, pole, 0.0]).unwrap(),
+            ..DesignPlant::eq6(2.2e-3)
+        };
+        let model = plant.loop_model().unwrap();
+        assert!((model.gain_per_s / gain - 1.0).abs() < 1e-6, "{model:?}");
+        assert!((model.feedthrough + gain / zero).abs() < 2e-4, "{model:?}");
+        assert!((model.fast_gain_per_s() / gain - 1.0).abs() < 1e-6);
+        let lqg = Requested::Given(ControllerConfig::Lqg(Lqg::default()));
+        let report = ends(request(plant, lqg))
+            .expect("it ends")
+            .expect("margins");
+        assert!(report.config.is_some(), "{:?}", report.warnings);
+    }
+}
+
 #[test]
 fn a_gain_that_no_stroke_can_use_gets_no_loop_and_its_value_is_named() {
     let pi = Pi::new(1.0, 1.0);

@@ -70,9 +70,16 @@ fn a_fast_flow_and_the_commands_against_it_take_no_bead_beside_another() {
 
 #[test]
 fn a_run_that_did_not_keep_its_bead_says_so_whatever_the_reason() {
+    let flipped = Row::flipped("lqg");
+    let flipped_late = Row {
+        seconds: flipped.at_s + 0.5,
+        ..flipped
+    };
     for (row, why) in [
         (Row::event("lqg", "lose-bead", 0.4), "another-bead"),
         (Row::to_the_end("pi", "stall-camera"), "out-of-sight"),
+        // Frozen a few milliseconds later, for less than the second that ends a run.
+        (flipped_late, "frozen"),
     ] {
         let held = hold(&row, 1);
         println!("{row} | {held}");
