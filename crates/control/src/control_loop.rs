@@ -132,15 +132,14 @@ impl<L: ControlLaw> ControlLoop<L> {
         if !(gain.is_finite() && sd > 0.0 && dof >= 1.0) {
             return;
         }
-        match state.adapt.as_mut() {
+        if state.adapt.is_none() {
+            let half = sd * student_t_quantile(0.975, dof);
+            let (low, high) = (gain - half, gain + half);
+            state.measured_gain = (low > 0.0).then(|| 1.0_f64.clamp(low, high));
+        } else if dof > 2.0 {
             // A normal distribution with the variance of Student's; with two degrees of freedom or fewer that is infinite.
-            Some(adapt) if dof > 2.0 => adapt.tell(gain, sd * (dof / (dof - 2.0)).sqrt()),
-            Some(_) => {}
-            None => {
-                let half = sd * student_t_quantile(0.975, dof);
-                let (low, high) = (gain - half, gain + half);
-                state.measured_gain = (low > 0.0).then(|| 1.0_f64.clamp(low, high));
-            }
+            let sd = sd * (dof / (dof - 2.0)).sqrt();
+            self.change_estimate(state, |_, adapt| adapt.tell(gain, sd));
         }
     }
 
@@ -176,14 +175,23 @@ impl<L: ControlLaw> ControlLoop<L> {
         }
     }
 
-    /// Updates the estimate of the plant after the command of a tick. If the tuning changes, the states of estimator and law change with
-    /// it, so that estimated position and command stay continuous.
+    /// Updates the estimate of the plant after the command of a tick.
     fn adapt(&self, state: &mut LoopState<L::State>, told: &TickOutcome) {
+        self.change_estimate(state, |adapter, adapt| adapter.step(adapt, told));
+    }
+
+    /// Changes the estimate of the plant. If the tuning changes, the states of estimator and law change with it, so that estimated
+    /// position and command stay continuous.
+    fn change_estimate(
+        &self,
+        state: &mut LoopState<L::State>,
+        change: impl FnOnce(&Adapter, &mut AdaptState),
+    ) {
         let (before, from) = (self.tuning(state), self.estimator_of(state));
         let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) else {
             return;
         };
-        adapter.step(adapt, told);
+        change(adapter, adapt);
         let (now, to) = (adapter.tuning(adapt), adapter.estimator(adapt));
         let stated = self.parts.estimator.gain_uncertainty;
         state.estimator.gain_doubt = adapter.gain_doubt(adapt, stated);

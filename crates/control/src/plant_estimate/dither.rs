@@ -3,8 +3,14 @@
 use super::motion::Motion;
 use crate::estimator::{Estimator, PredictedState};
 
-/// Ticks that the bead stays on a side at least: a plant that answers over two samples still answers a whole side.
-const STAY_TICKS: u32 = 2;
+/// Time in which a command of the dither moves the bead to the other side, s, or a tick if that is longer: half its power then lies below
+/// 440 Hz, about where an identification ends. A faster one would be answered by what the model has never seen, such as a PZT that rings.
+const MOVE_S: f64 = 1e-3;
+
+/// Ticks of a move. The bead then stays for as many at least: a plant that answers over two samples still answers a whole side.
+pub(super) fn move_ticks(sample_s: f64) -> u32 {
+    (MOVE_S / sample_s).round().max(1.0) as u32
+}
 
 /// State of the dither.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -16,7 +22,9 @@ pub(super) struct Dither {
     /// Motion of the model under the dither.
     pub motion: Motion,
     side: f64,
-    stayed: u32,
+    /// Command in each tick of the move to this side, um, and ticks since it began.
+    step_um: f64,
+    since: u32,
     bits: u32,
 }
 
@@ -27,27 +35,32 @@ impl Dither {
             given_um: 0.0,
             motion: Motion::start(0.0),
             side: 0.0,
-            stayed: 0,
+            step_um: 0.0,
+            since: 0,
             bits: 0x2545_f491,
         }
     }
 
-    /// The model one tick on, and the next command: sides `side_um` of PZT and tick from the middle. Whether all is finite.
-    pub(super) fn tick(&mut self, estimator: &Estimator, side_um: f64) -> bool {
+    /// The model one tick on, and the next command: sides `side_um` of PZT and tick from the middle, moves of `move_ticks`. Whether all is
+    /// finite.
+    pub(super) fn tick(&mut self, estimator: &Estimator, side_um: f64, move_ticks: u32) -> bool {
         self.given_um = self.command_um;
         let finite = self.motion.drive(estimator, self.command_um);
-        self.command_um = 0.0;
-        self.stayed += 1;
-        if self.stayed < STAY_TICKS {
-            return finite;
+        self.since += 1;
+        if self.since >= 2 * move_ticks {
+            self.since = 0;
+            // Galois' shift register of 32 bits, x^32 + x^22 + x^2 + x + 1: 50 days at 1 kHz until it comes round.
+            let bit = self.bits & 1;
+            self.bits = (self.bits >> 1) ^ (0x8020_0003 * bit);
+            let side_um = if bit == 1 { side_um } else { -side_um };
+            self.step_um = (side_um - self.side) / f64::from(move_ticks);
+            self.side = side_um;
         }
-        self.stayed = 0;
-        // Galois' shift register of 32 bits, x^32 + x^22 + x^2 + x + 1: 50 days at 1 kHz until it comes round.
-        let bit = self.bits & 1;
-        self.bits = (self.bits >> 1) ^ (0x8020_0003 * bit);
-        let side_um = if bit == 1 { side_um } else { -side_um };
-        self.command_um = side_um - self.side;
-        self.side = side_um;
+        self.command_um = if self.since < move_ticks {
+            self.step_um
+        } else {
+            0.0
+        };
         finite
     }
 
@@ -59,7 +72,8 @@ impl Dither {
 
     /// Back to the middle, while the loop does not control the bead.
     pub(super) fn rest(&mut self) {
-        (self.command_um, self.given_um, self.side) = (0.0, 0.0, 0.0);
+        (self.command_um, self.given_um) = (0.0, 0.0);
+        (self.side, self.step_um) = (0.0, 0.0);
         self.motion = Motion::start(0.0);
     }
 

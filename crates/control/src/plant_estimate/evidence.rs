@@ -117,8 +117,8 @@ impl Evidence {
         self.belief.tell(gain, sd);
     }
 
-    /// A fix. Whether a block is complete, so that [`Evidence::conclude`] has something to say.
-    pub(super) fn add(&mut self, fix: &Products) -> bool {
+    /// A fix. Whether a block of `block` of them is complete, so that [`Evidence::conclude`] has something to say.
+    pub(super) fn add(&mut self, fix: &Products, block: u32) -> bool {
         for i in 0..MEMBERS {
             let x = fix.weight * fix.x_um[i];
             self.block.xy[i] += x * fix.y_um;
@@ -128,11 +128,11 @@ impl Evidence {
             }
         }
         self.fixes += 1;
-        self.fixes >= BLOCK
+        self.fixes >= block
     }
 
-    /// At the end of a block, which `fix_s` from fix to fix have made. `believed` is the gain and delay by which the noise is judged.
-    pub(super) fn conclude(&mut self, fix_s: f64, frame: &Frame, (gain, delay): (f64, f64)) {
+    /// At the end of a block, which took `seconds`. `believed` is the gain and delay by which the noise is judged.
+    pub(super) fn conclude(&mut self, seconds: f64, frame: &Frame, (gain, delay): (f64, f64)) {
         let block = std::mem::take(&mut self.block);
         self.fixes = 0;
         let Some(l) = cholesky(&block.xx) else {
@@ -170,7 +170,6 @@ impl Evidence {
                 information: weight * dot(&by, &moved),
             }
         };
-        let seconds = f64::from(BLOCK) * fix_s;
         self.found = Some(self.belief.observe(likelihood, seconds));
         self.recent.take(&block);
     }

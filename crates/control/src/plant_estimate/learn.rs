@@ -143,16 +143,16 @@ impl Adapter {
         let y_um = series[0];
         let p_um = std::array::from_fn(|i| series[1 + i]);
         let x_um = std::array::from_fn(|i| series[1 + MEMBERS + i]);
-        let complete = state.evidence.add(&Products {
+        let products = Products {
             y_um,
             p_um,
             x_um,
             weight: 1.0 / far.max(1.0),
-        });
-        if complete {
+        };
+        if state.evidence.add(&products, self.block) {
             state.colour.solve();
-            let fix_s = self.interval * self.sample_s;
-            state.evidence.conclude(fix_s, &frame, believed);
+            let seconds = f64::from(self.block) * self.interval * self.sample_s;
+            state.evidence.conclude(seconds, &frame, believed);
         }
         true
     }

@@ -30,7 +30,7 @@ use colour::Colour;
 use dither::Dither;
 use evidence::Evidence;
 use lines::{LineSettings, Lines};
-use motion::{Alignment, Frame, Motion};
+use motion::{Alignment, BLOCK, Frame, Motion};
 pub use retuning::{AdaptMode, AdaptNews};
 use retuning::{DELAYS, INTERVAL, NOMINAL, REPORTED_GAIN, Retuning, TUNINGS};
 use serde::Serialize;
@@ -91,6 +91,9 @@ pub(crate) struct Adapter {
     forward: FeedForward,
     /// Command for a tick that moves the bead from the middle to a side of the dither, um.
     side_um: f64,
+    /// Ticks that this takes, and fixes of a block of evidence.
+    move_ticks: u32,
+    block: u32,
 }
 
 /// State of the estimate.
@@ -120,9 +123,11 @@ pub struct AdaptState {
 }
 
 impl AdaptState {
-    /// A gain over the model's that was measured otherwise, with its standard deviation.
+    /// A gain over the model's that was measured otherwise, with its standard deviation. If it is surely larger than the one in force,
+    /// the law is as cautious at once: its next command may be the largest of the run, that to the target.
     pub(crate) fn tell(&mut self, gain: f64, sd: f64) {
         self.evidence.tell(gain, sd);
+        self.force.caution(gain, sd);
     }
 }
 
@@ -147,6 +152,7 @@ impl Adapter {
     /// As [`Estimator::new`].
     pub(crate) fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
         let ts = model.sample_time_s;
+        let move_ticks = dither::move_ticks(ts);
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
         let drift_um2 =
             (config.neutral_walk_um_per_sqrt_s.max(0.01) * model.gain_per_s * ts).powi(2) * ts;
@@ -157,6 +163,8 @@ impl Adapter {
         Ok(Self {
             // Independent of the rest of the error, so that the squares add.
             side_um: (0.02 * config.dither_percent).sqrt() * hold_um / moves,
+            move_ticks,
+            block: BLOCK * (f64::from(move_ticks) / config.ticks_per_fix).max(1.0) as u32,
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
@@ -342,7 +350,7 @@ impl Adapter {
         let chosen_um = chosen_um + state.dither.command_um;
         let louder = (state.evidence.found).map_or(LOUDEST, |found| found.log_sd / KNOWN);
         let side_um = self.side_um * louder.clamp(1.0, LOUDEST) * (-state.force.log_gain).exp();
-        let dithered = state.dither.tick(&self.nominal, side_um);
+        let dithered = state.dither.tick(&self.nominal, side_um, self.move_ticks);
         let instrument = state.instrument.drive(&self.nominal, chosen_um);
         state.model.drive(&self.nominal, command_um) && dithered && instrument
     }

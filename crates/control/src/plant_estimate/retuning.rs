@@ -138,6 +138,13 @@ impl Retuning {
         };
     }
 
+    /// To a gain that was measured otherwise, with its standard deviation, if it is surely the larger one.
+    pub(super) fn caution(&mut self, gain: f64, sd: f64) {
+        if gain > 0.0 && gain - INTERVAL * sd > self.log_gain.exp() {
+            self.go(gain.ln() - self.log_gain);
+        }
+    }
+
     /// Towards another gain, by the logarithm, no faster than it may.
     pub(super) fn go(&mut self, way: f64) {
         self.log_gain = self.log_gain_after(way);

@@ -373,6 +373,25 @@ fn the_estimate_begins_with_the_gain_that_arming_measured() {
     assert!((now.gain - 1.0).abs() < 0.2, "{now:?}");
 }
 
+/// The command to the target comes first, and is the largest of many a run.
+#[test]
+fn a_gain_that_arming_found_surely_larger_is_in_force_from_the_first_command_on() {
+    for (gain, sd, in_force) in [
+        (1.87, 0.13, 1.87),
+        (2.6, 0.1, 2.5),
+        (1.2, 0.15, 1.0),
+        // Boldness comes slowly.
+        (0.5, 0.02, 1.0),
+        (f64::NAN, 0.1, 1.0),
+    ] {
+        let mut controller = Controller::new(adapting(lqg())).unwrap();
+        controller.start(20.0, 20.0);
+        controller.start_estimate(gain, sd, 1e6);
+        let now = controller.adaptation().unwrap();
+        assert!((now.gain - in_force).abs() < 1e-9, "{gain}: {now:?}");
+    }
+}
+
 /// A loop that does not adapt: the feed-forward is divided by what was measured, as far as that surely differs from the model's. The
 /// 95 % interval of ten degrees of freedom is 2.228 standard deviations each way.
 #[test]

@@ -16,6 +16,18 @@ const LEAST_SHARE: f64 = 0.3;
 const ROUNDS: usize = 3;
 
 impl Localiser {
+    /// Position of a bead at a place (px) where none was: unless the narrow window shows one now, nothing else is tried, which takes a
+    /// fifth of the time of [`Localiser::locate`].
+    pub(crate) fn locate_where_none_was(&mut self, frame: &Frame, place_px: (f64, f64)) -> Fix {
+        let view = View::of(frame);
+        let side_px = self.narrow_px().min(self.config.window_px);
+        let fix = self.attempt(&view, place_px, side_px);
+        if fix.verdict == FixQuality::Good {
+            return self.locate_in(&view, place_px);
+        }
+        fix
+    }
+
     /// Positions of all beads near the places given (px), into `fixes`: one a bead, of any verdict. Beads whose images overlap are
     /// fitted together.
     pub fn locate_all(

@@ -222,11 +222,16 @@ impl Localiser {
         self.locate_in(&View::of(frame), (x_px, y_px))
     }
 
+    /// Side of the window that just holds the bead, px.
+    fn narrow_px(&self) -> usize {
+        2 * (NARROW_RADII * self.template.radius_px()).ceil() as usize + 1
+    }
+
     /// Position of the bead nearest to a place (px).
     fn locate_in(&mut self, view: &View, (x_px, y_px): (f64, f64)) -> Fix {
         let radius_px = self.template.radius_px();
         let window_px = self.config.window_px;
-        let narrow_px = 2 * (NARROW_RADII * radius_px).ceil() as usize + 1;
+        let narrow_px = self.narrow_px();
         let narrow_first = self.narrow_fixes > 0 && narrow_px < window_px;
         if narrow_first {
             self.narrow_fixes -= 1;

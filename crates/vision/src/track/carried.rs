@@ -61,12 +61,14 @@ impl Tracker {
         }
     }
 
-    /// Remembers what is seen besides the chosen bead, which is `ours`. A bead that touches another may be refused for once: what
-    /// is followed as a neighbour stays a bead.
-    pub(super) fn remember_beside(&mut self, ours: &Candidate) {
+    /// Remembers what is seen besides the chosen bead, which is `ours`, if it is seen. A bead that touches another may be refused for once:
+    /// what is followed as a neighbour stays a bead.
+    pub(super) fn remember_beside(&mut self, ours: Option<&Candidate>) {
         let radius_px = self.localiser.template().radius_px();
         let is_near = |(x, y): (f64, f64), (u, v): (f64, f64)| f64::hypot(x - u, y - v) < radius_px;
-        let is_other = |c: &&Candidate| !is_near(c.seen_px, (ours.fix.x_px, ours.fix.y_px));
+        let is_other = |c: &&Candidate| {
+            ours.is_none_or(|ours| !is_near(c.seen_px, (ours.fix.x_px, ours.fix.y_px)))
+        };
         let is_bead = |c: &Candidate| {
             let followed = self.chosen.is_some_and(|chosen| {
                 let mut known = self.neighbours.confirmed(&chosen.motion, &self.config);

@@ -217,10 +217,11 @@ impl Tracker {
             .iter()
             .flatten()
             .filter(|c| c.fix.verdict == FixQuality::Good);
-        let Some(best) = good
+        let best = good
             .min_by(|a, b| distance(a).total_cmp(&distance(b)))
-            .copied()
-        else {
+            .copied();
+        self.remember_beside(best.as_ref());
+        let Some(best) = best else {
             let seen = self.candidates.iter().flatten().next().map(|c| c.fix);
             return (
                 seen.map_or(Decision::NothingFound, |f| refusal(f.verdict)),
@@ -242,14 +243,18 @@ impl Tracker {
         mut chosen: Chosen,
         time_s: f64,
     ) -> (Decision, Option<Fix>) {
-        self.look_around(frame, false, None);
-        let (mut fix, mut size) = (Fix::none(0.0, 0.0, FixQuality::NoSignal), None);
-        let away = |c: &&Candidate| chosen.motion.distance2(&c.fix);
-        let seen = self.candidates.iter().flatten();
-        if let Some(c) = seen.min_by(|a, b| away(a).total_cmp(&away(b))) {
-            (fix, size) = (c.fix, c.size);
+        let fix = (self.localiser).locate(frame, Some(chosen.motion.position()));
+        let mut seen = Candidate::new(fix, self.localiser.relative_size(&fix));
+        if !self.is_predicted(&chosen, &seen) {
+            self.look_around(frame, false, None);
+            let away = |c: &Candidate| chosen.motion.distance2(&c.fix);
+            let others = self.candidates.iter().flatten();
+            if let Some(nearest) = others.min_by(|a, b| away(a).total_cmp(&away(b))) {
+                seen = *nearest;
+            }
         }
-        if self.is_predicted(&chosen, &Candidate::new(fix, size)) {
+        let Candidate { fix, size, .. } = seen;
+        if self.is_predicted(&chosen, &seen) {
             chosen.motion.update(&fix);
             chosen.identity.update(&fix, size);
             chosen.confirmed += 1;
@@ -355,13 +360,14 @@ impl Tracker {
             Some(Claim::Ours) => best,
             _ => None,
         };
+        let field = self.field(frame);
         self.neighbours.update(
             &chosen.motion,
             &self.candidates,
             taken,
             time_s,
             &self.config,
-            (frame.width, frame.height),
+            field,
         );
         match (
             taken.and_then(|k| self.candidates.get(k).copied().flatten()),
@@ -382,7 +388,7 @@ impl Tracker {
                     chosen
                 };
                 self.take(restarted, &c, time_s);
-                self.remember_beside(&c);
+                self.remember_beside(Some(&c));
                 (decision, Some(c.fix))
             }
             (None, Some(_)) => (Decision::Ambiguous, nearest),

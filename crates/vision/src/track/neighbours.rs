@@ -65,6 +65,26 @@ struct Neighbour {
     seen_s: f64,
     /// Frames in which it was seen.
     sights: u32,
+    sight: Sight,
+}
+
+/// Whether a neighbour is seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Sight {
+    Seen,
+    /// Not since another bead was near enough to hide it.
+    Hidden,
+    /// Not since it went out of sight with no bead near: over the border, or out of focus. That it is not seen now is no surprise.
+    Gone,
+}
+
+/// What a frame shows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Field {
+    pub width_px: usize,
+    pub height_px: usize,
+    /// Beads nearer to each other may be seen as one.
+    pub touching_px: f64,
 }
 
 impl Neighbour {
@@ -210,7 +230,7 @@ impl Neighbours {
         for (flag, bead) in open.iter_mut().zip(&self.beads) {
             *flag = bead.is_some();
         }
-        for _ in 0..self.count() {
+        loop {
             let mut least = (MISS, None);
             for (i, n) in self.beads.iter().enumerate().filter(|(i, _)| open[*i]) {
                 for (k, c) in candidates.iter().enumerate().filter(|(k, _)| !used[*k]) {
@@ -221,12 +241,17 @@ impl Neighbours {
                     }
                 }
             }
-            cost += least.0;
-            if let Some((i, k)) = least.1 {
-                (open[i], used[k], sights[i]) = (false, true, Some(k));
-            }
+            let (surprise, Some((i, k))) = least else {
+                break;
+            };
+            cost += surprise;
+            (open[i], used[k], sights[i]) = (false, true, Some(k));
         }
-        (sights, cost)
+        let hidden = self.beads.iter().zip(open).filter(|(_, open)| *open);
+        let missed = hidden
+            .filter(|(n, _)| n.is_some_and(|n| n.sight != Sight::Gone))
+            .count();
+        (sights, cost + MISS * missed as f64)
     }
 
     /// Takes in the other beads seen with the chosen bead (`taken`, whose motion is `ours`). While the chosen bead itself is
@@ -238,7 +263,7 @@ impl Neighbours {
         taken: Option<usize>,
         time_s: f64,
         config: &TrackerConfig,
-        (width, height): (usize, usize),
+        field: Field,
     ) {
         let taken_fix = taken.and_then(|k| Some(candidates.get(k)?.as_ref()?.fix));
         let known = taken_fix.map_or(*ours, |fix| Motion::at(&fix, ours));
@@ -261,6 +286,17 @@ impl Neighbours {
         });
         for (slot, sight) in self.beads.iter_mut().zip(sights) {
             let Some(n) = slot else { continue };
+            if sight.is_none() && n.sight == Sight::Seen {
+                let (x, y) = moves(n).position();
+                let near =
+                    |c: &Candidate| f64::hypot(c.fix.x_px - x, c.fix.y_px - y) < field.touching_px;
+                let mut beads = candidates.iter().enumerate();
+                let hides = |(k, c): (usize, &Option<Candidate>)| {
+                    (taken == Some(k) || sights.contains(&Some(k))) && c.is_some_and(|c| near(&c))
+                };
+                let alone = taken.is_some() && !beads.any(hides);
+                n.sight = if alone { Sight::Gone } else { Sight::Hidden };
+            }
             if let Some(c) = sight.and_then(|k| candidates.get(k)?.as_ref()) {
                 n.motion.update(&c.fix);
                 if let Some(own) = &taken_fix {
@@ -269,6 +305,7 @@ impl Neighbours {
                 n.amplitude += AMPLITUDE_SHARE * (c.fix.amplitude - n.amplitude);
                 n.seen_s = time_s;
                 n.sights = n.sights.saturating_add(1);
+                n.sight = Sight::Seen;
             } else if let Some(own) = taken_fix.filter(|_| stepped) {
                 // The flow took it along, unseen.
                 n.motion.carry(ours.way_to(&own));
@@ -278,7 +315,7 @@ impl Neighbours {
             let (x, y) = motion.position();
             let sure_px = 3.0 * motion.sd_px();
             let beyond = |c: f64, len: usize| c < -sure_px || c > len as f64 - 1.0 + sure_px;
-            let left = beyond(x, width) || beyond(y, height);
+            let left = beyond(x, field.width_px) || beyond(y, field.height_px);
             let memory_s = if left { config.coast_limit_s } else { MEMORY_S };
             let unseen_s = time_s - n.seen_s;
             let doubtful = !n.is_confirmed(config) && unseen_s > 0.0;
@@ -301,6 +338,7 @@ impl Neighbours {
                     amplitude: c.fix.amplitude,
                     seen_s: time_s,
                     sights: 1,
+                    sight: Sight::Seen,
                 });
             }
         }

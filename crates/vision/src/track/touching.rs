@@ -1,7 +1,7 @@
 //! Beads whose images overlap: what one template fits badly is fitted as several beads, and a flow carries them alike.
 
 use super::carried::STREAK_PX;
-use super::neighbours::{Candidate, MAX_BEADS, is_sight};
+use super::neighbours::{Candidate, Field, MAX_BEADS, is_sight};
 use super::{Chosen, Tracker};
 use crate::frame::Frame;
 use crate::joint::MOST_TOGETHER;
@@ -15,6 +15,18 @@ const TOUCHING_RADII: f64 = 5.0;
 type Starts = [Start; MOST_TOGETHER];
 
 impl Tracker {
+    fn touching_px(&self) -> f64 {
+        TOUCHING_RADII * self.localiser.template().radius_px()
+    }
+
+    pub(super) fn field(&self, frame: &Frame) -> Field {
+        Field {
+            width_px: frame.width,
+            height_px: frame.height,
+            touching_px: self.touching_px(),
+        }
+    }
+
     /// Locates every bead that the detector sees, those near each other together; with `carried` also as a step of the flow draws
     /// them out that has carried the chosen bead to one of them. One that is `known` and stands alone is not located again. Whether
     /// all that are near each other were beads.
@@ -33,11 +45,14 @@ impl Tracker {
         }
         let seen = &seen[..count];
         let radius_px = self.localiser.template().radius_px();
-        // What is no bead is fitted with none: their fit would not be good.
-        let mut alone = [false; MAX_BEADS];
-        for (flag, place) in alone.iter_mut().zip(seen) {
+        let mut no_bead = [false; MAX_BEADS];
+        for (flag, place) in no_bead.iter_mut().zip(seen) {
             *flag = self.beside.is_no_bead(*place, radius_px);
         }
+        // What is no bead is fitted with none: their fit would not be good. In a search two that touch may have been taken for that.
+        let alone = no_bead.map(|flag| flag && self.chosen.is_some());
+        // Of the places where no bead was, one in each frame is tried in every way.
+        let in_full = self.frames as usize % count.max(1);
         let (mut done, mut all_seen) = ([false; MAX_BEADS], true);
         for k in 0..count {
             if done[k] {
@@ -61,7 +76,11 @@ impl Tracker {
             let candidate = if let Some(known) = known.filter(is_it) {
                 *known
             } else {
-                let fix = self.localiser.locate(frame, Some(seen[k]));
+                let fix = if no_bead[k] && k != in_full {
+                    self.localiser.locate_where_none_was(frame, seen[k])
+                } else {
+                    self.localiser.locate(frame, Some(seen[k]))
+                };
                 Candidate {
                     size: self.localiser.relative_size(&fix),
                     seen_px: seen[k],
@@ -75,7 +94,7 @@ impl Tracker {
 
     /// Those of the places that are near to the place `k`, or to one that is; of those that stand alone none.
     fn group(&self, seen: &[(f64, f64)], alone: &[bool; MAX_BEADS], k: usize) -> [bool; MAX_BEADS] {
-        let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
+        let reach_px = self.touching_px();
         let mut members = [false; MAX_BEADS];
         members[k] = true;
         // A chain of places grows by at least one in each round, or is whole.
@@ -178,7 +197,7 @@ impl Tracker {
             y += share * start.place_px.1;
         }
         let away_px = |c: &Candidate| f64::hypot(c.seen_px.0 - x, c.seen_px.1 - y);
-        let reach_px = TOUCHING_RADII * radius_px;
+        let reach_px = self.touching_px();
         let is_seen = |c: &&Candidate| is_sight(&c.fix) && away_px(c) < reach_px;
         if self.candidates.iter().flatten().filter(is_seen).count() >= n {
             return;
@@ -224,7 +243,7 @@ impl Tracker {
     /// Where the chosen bead and the neighbours that touch it are predicted. A contrast is known to a third of the change that
     /// is allowed at most.
     fn predicted_group(&self, chosen: &Chosen) -> (Starts, usize) {
-        let reach_px = TOUCHING_RADII * self.localiser.template().radius_px();
+        let reach_px = self.touching_px();
         let own_px = chosen.motion.position();
         let share = self.config.max_amplitude_change / 3.0;
         let contrast = |amplitude: f64| Some((amplitude, share * amplitude.abs()));

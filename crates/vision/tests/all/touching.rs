@@ -192,6 +192,65 @@ fn flows_that_step_part_no_bead_from_its_identity_in_many_runs() {
     table(20);
 }
 
+/// A bead is held while another leaves the picture; then the flow steps by `flow` (px/s) and back, and the loop takes it up.
+fn run_beside_one_that_leaves(seed: u64, flow: f64, outcome: &mut Outcome) {
+    let (mut random, template) = (Random(seed), template());
+    let mut tracker = Tracker::new(localiser(), TrackerConfig::default()).expect("a tracker");
+    let (mut own, mut apart): ((f64, f64), (f64, f64)) = ((63.0, 32.0), (50.0, 3.0));
+    tracker.choose(Some(own));
+    let sd = (2.0 * DIFFUSION * DT_S).sqrt();
+    let (mut held, mut back, mut before_px) = (0.0, 0.0, 0.0);
+    for n in 0..900 {
+        let stepped = if n >= 300 && n / 150 % 2 == 1 {
+            flow
+        } else {
+            0.0
+        };
+        let way_px = (stepped - held + back) * EXPOSURE_S;
+        let other = (own.0 + apart.0, own.1 + apart.1);
+        let ways_px = [std::mem::replace(&mut before_px, way_px), way_px];
+        let pixels = picture(&template, &[own, other], ways_px, &mut random);
+        let commanded = Commanded {
+            flow_px_per_s: (back - held, 0.0),
+            streak_px: ((back - held) * EXPOSURE_S, 0.0),
+            turn_px: (0.0, 0.0),
+            exposure_s: EXPOSURE_S,
+        };
+        let t = tracker.step(Some(&frame(&pixels)), f64::from(n) * DT_S, commanded);
+        (held, back) = if t.state == TrackState::Tracking {
+            (held + 0.3 * (stepped - held), -0.2 * (own.0 - 63.0) / DT_S)
+        } else {
+            outcome.blind_frames += 1;
+            (held, 0.0)
+        };
+        if t.state == TrackState::Lost {
+            outcome.lost += 1;
+            return;
+        }
+        let walk = [(); 4].map(|()| sd * random.normal());
+        own.0 += (stepped - held + back) * DT_S + walk[0];
+        own.1 += walk[1] - 0.02 * (own.1 - 32.0);
+        apart.0 += walk[2] - walk[0] + 0.04;
+        apart.1 += walk[3] - walk[1] - 0.02 * apart.1;
+    }
+    outcome.kept += 1;
+}
+
+#[test]
+fn a_bead_whose_neighbour_has_left_the_picture_is_not_taken_for_it_when_the_flow_steps() {
+    let seeds = 5;
+    for flow in [1140.0, -1140.0, 3790.0] {
+        let mut outcome = Outcome::default();
+        for seed in 1..=seeds as u64 {
+            run_beside_one_that_leaves(seed * 7919, flow, &mut outcome);
+        }
+        println!("{flow} px/s: {outcome:?}");
+        // Two frames to confirm the bead, and one of each of five steps at most.
+        let all = outcome.kept == seeds && outcome.blind_frames <= 7 * seeds;
+        assert!(all, "{flow} px/s: {outcome:?}");
+    }
+}
+
 /// Dust and a wall stay where they are and are no beads. Each search fits them again, but not as images that a flow draws out.
 #[test]
 fn what_stands_beside_a_bead_takes_little_of_a_frames_time() {
