@@ -7,7 +7,7 @@ use crate::estimator::{Estimator, PredictedState};
 /// 440 Hz, about where an identification ends. A faster one would be answered by what the model has never seen, such as a PZT that rings.
 const MOVE_S: f64 = 1e-3;
 
-/// Ticks of a move. The bead then stays for as many at least: a plant that answers over two samples still answers a whole side.
+/// Ticks of a move. The bead then stays for one at least: a plant that answers over two samples still answers a whole side.
 pub(super) fn move_ticks(sample_s: f64) -> u32 {
     (MOVE_S / sample_s).round().max(1.0) as u32
 }
@@ -47,7 +47,7 @@ impl Dither {
         self.given_um = self.command_um;
         let finite = self.motion.drive(estimator, self.command_um);
         self.since += 1;
-        if self.since >= 2 * move_ticks {
+        if self.since > move_ticks {
             self.since = 0;
             // Galois' shift register of 32 bits, x^32 + x^22 + x^2 + x + 1: 50 days at 1 kHz until it comes round.
             let bit = self.bits & 1;

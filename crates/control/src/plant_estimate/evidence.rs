@@ -140,11 +140,10 @@ impl Evidence {
         };
         let e = frame.of(delay);
         let left: Vector = std::array::from_fn(|i| block.xy[i] - gain * dot(&block.xp[i], &e));
-        let white = forward(&l, &left);
-        let left_um2 = dot(&white, &white) / MEMBERS as f64;
+        // Moves of the dither that end with the fixes show themselves in fewer ways than there are members.
+        let (left_um2, members) = mean_square(&l, &block.xx, &left);
         self.blocks += 1.0;
         let scale = self.blocks.min(SCALE_BLOCKS);
-        let members = MEMBERS as f64;
         let weight = (scale + members) / (scale * self.noise_um2 + members * left_um2);
         self.noise_um2 += (left_um2 - self.noise_um2) / (scale + 1.0);
         let part = part(self.blocks, MEMORY);
@@ -152,8 +151,7 @@ impl Evidence {
         // chosen is known from the blocks before.
         let answered: Vector =
             std::array::from_fn(|i| dot(&block.xp[i], &e) - dot(&block.xx[i], &e));
-        let white = forward(&l, &answered);
-        let answer_um2 = dot(&white, &white) / MEMBERS as f64;
+        let (answer_um2, _) = mean_square(&l, &block.xx, &answered);
         self.answer_um2 += part * (answer_um2 - self.answer_um2);
         let answer = self.recent.answer(self.answer_um2);
         let commanded = |delay: f64| -> Vector {
@@ -175,6 +173,20 @@ impl Evidence {
     }
 }
 
+/// Share of a matrix' trace below which a direction of it is empty.
+const EMPTY: f64 = 1e-6;
+
+/// Mean square of a vector by the matrix `v`, whose factor is `l`, in the directions that are not empty, and how many those are.
+fn mean_square(l: &Matrix, v: &Matrix, b: &Vector) -> (f64, f64) {
+    let trace: f64 = (0..MEMBERS).map(|i| v[i][i]).sum();
+    let white = forward(l, b);
+    let full = (0..MEMBERS).filter(|&i| l[i][i] * l[i][i] > EMPTY * trace);
+    let (sum, count) = full.fold((0.0, 0.0), |(sum, count), i| {
+        (sum + white[i] * white[i], count + 1.0)
+    });
+    (sum / count, count)
+}
+
 /// Factor of a matrix; `None` if it is zero.
 fn cholesky(v: &Matrix) -> Option<Matrix> {
     let trace: f64 = (0..MEMBERS).map(|i| v[i][i]).sum();
@@ -186,7 +198,7 @@ fn cholesky(v: &Matrix) -> Option<Matrix> {
         for j in 0..=i {
             let sum: f64 = (0..j).map(|k| l[i][k] * l[j][k]).sum();
             l[i][j] = if i == j {
-                (v[i][i] - sum).max(1e-6 * trace).sqrt()
+                (v[i][i] - sum).max(EMPTY * trace).sqrt()
             } else {
                 (v[i][j] - sum) / l[j][j]
             };
@@ -241,14 +253,15 @@ mod tests {
                 x_um[0] = side_um - before_um;
                 wander_um = 0.95 * wander_um + 5e-3 * random.normal();
                 let p_um = x_um.map(|x| x + wander_um);
-                let complete = evidence.add(&Products {
+                let products = Products {
                     y_um: p_um[1] + 0.03 * random.normal(),
                     p_um,
                     x_um,
                     weight: 1.0,
-                });
-                if complete {
-                    evidence.conclude(1e-3, &frame, (1.0, 0.0));
+                };
+                if evidence.add(&products, BLOCK) {
+                    let seconds = 1e-3 * f64::from(BLOCK);
+                    evidence.conclude(seconds, &frame, (1.0, 0.0));
                     let answer = evidence.recent.answer(evidence.answer_um2);
                     for (i, row) in answer.iter().enumerate() {
                         for (j, part) in row.iter().enumerate() {

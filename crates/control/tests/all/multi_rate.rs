@@ -119,41 +119,47 @@ impl Held {
 #[test]
 fn a_loop_faster_than_its_camera_adapts_over_the_spread_and_states_gains_that_are_right() {
     let (mut stated, mut outside) = (0, 0);
-    for every in [1, 2, 5] {
-        let mut held = Held::new(
-            ControllerConfig::Lqg(Lqg::default()),
-            every,
-            true,
-            7 + first_seed(),
-        );
+    for (every, other) in [1, 2, 5]
+        .into_iter()
+        .flat_map(|every| (0..4).map(move |n| (every, n)))
+    {
+        let seed = 7 + first_seed() + 100 * other;
+        let mut held = Held::new(ControllerConfig::Lqg(Lqg::default()), every, true, seed);
         let stay = held.hold(25, 10);
-        println!("{every} ticks a fix, nothing changes: {stay:?}");
-        assert!(held.events.is_empty(), "{every}: {:?}", held.events);
+        println!("{every} ticks a fix, seed {seed}, nothing changes: {stay:?}");
+        let quiet = (stay, std::mem::take(&mut held.events));
+        let changed = [0.5, 2.0, 1.0].map(|gain| {
+            held.rig.gain = gain;
+            held.events.clear();
+            let stay = held.hold(18, 8);
+            println!("{every} ticks a fix, seed {seed}, gain {gain}: {stay:?}");
+            stated += stay.stated;
+            outside += stay.outside;
+            (gain, stay, std::mem::take(&mut held.events))
+        });
+        // Of chance there is more than one seed bears: the others count together.
+        if other > 0 {
+            continue;
+        }
+        let (stay, events) = quiet;
+        assert!(events.is_empty(), "{every}: {events:?}");
         assert!(
             stay.stated > 100 && stay.farthest < 3.0,
             "{every}: {stay:?}"
         );
         assert!(stay.last.gain.ln().abs() < 0.08, "{every}: {stay:?}");
         assert!(stay.last.delay_samples == 0.0, "{every}: {stay:?}");
-        for gain in [0.5, 2.0, 1.0] {
-            held.rig.gain = gain;
-            held.events.clear();
-            let stay = held.hold(18, 8);
-            println!(
-                "{every} ticks a fix, gain {gain}: {stay:?} {:?}",
-                held.events
-            );
+        for (gain, stay, events) in changed {
             assert!(stay.over_bound < 1.2, "{every}, {gain}: {stay:?}");
-            stated += stay.stated;
-            outside += stay.outside;
             assert!(
                 (stay.last.gain / gain).ln().abs() < 0.12,
                 "{every}: {stay:?}"
             );
-            assert!(!held.events.is_empty(), "{every}, {gain}: nothing told");
+            assert!(!events.is_empty(), "{every}, {gain}: nothing told");
         }
     }
-    // The estimate remembers 8 s: the nine stays are eleven looks or so.
+    // The estimate remembers 8 s: the 36 stays are 45 looks or so.
+    println!("{outside} of {stated} outside");
     assert!(outside * 10 <= stated, "{outside} of {stated}");
 }
 
