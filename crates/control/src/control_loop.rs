@@ -125,17 +125,15 @@ impl<L: ControlLaw> ControlLoop<L> {
         Some(adapter.adaptation(state.adapt.as_ref()?))
     }
 
-    /// The gain over the model's was measured before the loop is closed, with a standard deviation that is known from `dof` degrees of
-    /// freedom: the estimate of the plant begins there. The feed-forward of a loop that does not adapt is divided by the gain within the
-    /// 95 % interval that is nearest to the model's.
+    /// The gain over the model's was measured before the loop is closed, with a standard deviation of `dof` degrees of freedom: the estimate
+    /// begins there. The feed-forward of a loop that does not adapt is divided by the gain in the 95 % interval nearest to the model's.
     pub fn start_estimate(&self, state: &mut LoopState<L::State>, gain: f64, sd: f64, dof: f64) {
         if !(gain.is_finite() && sd > 0.0 && dof >= 1.0) {
             return;
         }
         if state.adapt.is_none() {
             let half = sd * student_t_quantile(0.975, dof);
-            let (low, high) = (gain - half, gain + half);
-            state.measured_gain = (low > 0.0).then(|| 1.0_f64.clamp(low, high));
+            state.measured_gain = (gain > half).then(|| 1.0_f64.clamp(gain - half, gain + half));
         } else if dof > 2.0 {
             // A normal distribution with the variance of Student's; with two degrees of freedom or fewer that is infinite.
             let sd = sd * (dof / (dof - 2.0)).sqrt();
@@ -175,13 +173,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         }
     }
 
-    /// Updates the estimate of the plant after the command of a tick.
-    fn adapt(&self, state: &mut LoopState<L::State>, told: &TickOutcome) {
-        self.change_estimate(state, |adapter, adapt| adapter.step(adapt, told));
-    }
-
-    /// Changes the estimate of the plant. If the tuning changes, the states of estimator and law change with it, so that estimated
-    /// position and command stay continuous.
+    /// Changes the estimate of the plant. Where the tuning changes, estimated position and command stay continuous.
     fn change_estimate(
         &self,
         state: &mut LoopState<L::State>,
@@ -309,7 +301,7 @@ impl<L: ControlLaw> ControlLoop<L> {
                     && !estimate.stepped
                     && !output.flags.not_finite,
             };
-            self.adapt(state, &told);
+            self.change_estimate(state, |adapter, adapt| adapter.step(adapt, &told));
         }
         output
     }

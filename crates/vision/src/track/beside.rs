@@ -1,10 +1,7 @@
 //! What is in the picture beside the chosen bead: dust, pieces of wall, and beads that are followed.
 
-use super::Tracker;
 use super::motion::Motion;
 use super::neighbours::{Candidate, MAX_BEADS};
-use crate::fix::FixQuality;
-use crate::frame::Frame;
 
 /// What was seen beside the chosen bead when it was last taken: places in the frame, px, and whether each is a bead.
 #[derive(Debug, Clone, Copy, Default)]
@@ -40,55 +37,7 @@ impl Beside {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Owed {
     /// The bead's motion, as predicted for the frame.
-    motion: Motion,
-    bead: Candidate,
-    time_s: f64,
-}
-
-impl Owed {
-    pub(super) fn new(motion: Motion, bead: Candidate, time_s: f64) -> Self {
-        Self {
-            motion,
-            bead,
-            time_s,
-        }
-    }
-}
-
-impl Tracker {
-    /// Looks at what else is in a frame, the one given to [`Tracker::step_at_once`] before, if a look is due; whether one was.
-    pub fn look_beside(&mut self, frame: &Frame) -> bool {
-        let Some(Owed {
-            motion,
-            bead,
-            time_s,
-        }) = self.owed.take()
-        else {
-            return false;
-        };
-        self.look_around(frame, false, Some(&bead));
-        // The detector may miss the bead, or have no place left for it.
-        self.add_candidate(bead);
-        let radius_px = self.localiser.template().radius_px();
-        let away_px =
-            |c: &Candidate| f64::hypot(c.fix.x_px - bead.fix.x_px, c.fix.y_px - bead.fix.y_px);
-        let near = |c: &Candidate| c.fix.verdict == FixQuality::Good && away_px(c) < radius_px;
-        let seen = self.candidates.iter().enumerate();
-        let ours = seen
-            .filter_map(|(k, c)| c.filter(near).map(|c| (k, c)))
-            .min_by(|a, b| away_px(&a.1).total_cmp(&away_px(&b.1)));
-        let field = self.field(frame);
-        self.neighbours.update(
-            &motion,
-            &self.candidates,
-            ours.map(|(k, _)| k),
-            time_s,
-            &self.config,
-            field,
-        );
-        if let Some((_, ours)) = ours {
-            self.remember_beside(Some(&ours));
-        }
-        true
-    }
+    pub(super) motion: Motion,
+    pub(super) bead: Candidate,
+    pub(super) time_s: f64,
 }

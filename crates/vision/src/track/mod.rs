@@ -12,6 +12,7 @@ mod carried;
 mod cell;
 mod config;
 mod identity;
+mod look;
 mod motion;
 mod neighbours;
 mod standing;
@@ -287,7 +288,11 @@ impl Tracker {
             let candidate = Candidate::new(fix, size);
             if self.is_predicted(&chosen, &candidate) {
                 if self.frames.is_multiple_of(self.config.neighbour_stride) {
-                    self.owed = Some(Owed::new(chosen.motion, candidate, time_s));
+                    self.owed = Some(Owed {
+                        motion: chosen.motion,
+                        bead: candidate,
+                        time_s,
+                    });
                 }
                 self.take(chosen, &candidate, time_s);
                 return (Decision::Accepted, Some(fix));
