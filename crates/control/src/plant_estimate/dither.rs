@@ -3,8 +3,8 @@
 use super::motion::Motion;
 use crate::estimator::{Estimator, PredictedState};
 
-/// Time in which a command of the dither moves the bead to the other side, s, or a tick if that is longer: half its power then lies below
-/// 440 Hz, about where an identification ends. A faster one would be answered by what the model has never seen, such as a PZT that rings.
+/// Time in which a command of the dither moves the bead to the other side, s, or a tick if that is longer. Its power is down to a half at
+/// 440 Hz, a little beyond the lines of an identification. A faster command would make a PZT ring, which no model has seen there.
 const MOVE_S: f64 = 1e-3;
 
 /// Ticks of a move. The bead then stays for one at least: a plant that answers over two samples still answers a whole side.

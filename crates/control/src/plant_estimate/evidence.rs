@@ -117,7 +117,7 @@ impl Evidence {
         self.belief.tell(gain, sd);
     }
 
-    /// A fix. Whether a block of `block` of them is complete, so that [`Evidence::conclude`] has something to say.
+    /// A fix. Whether a block of `block` fixes is complete, so that [`Evidence::conclude`] has something to say.
     pub(super) fn add(&mut self, fix: &Products, block: u32) -> bool {
         for i in 0..MEMBERS {
             let x = fix.weight * fix.x_um[i];

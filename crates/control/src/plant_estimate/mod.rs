@@ -124,7 +124,7 @@ pub struct AdaptState {
 
 impl AdaptState {
     /// A gain over the model's that was measured otherwise, with its standard deviation. If it is surely larger than the one in force,
-    /// the law is as cautious at once: its next command may be the largest of the run, that to the target.
+    /// the law is as cautious at once. Its next command, that to the target, may be the largest of the run.
     pub(crate) fn tell(&mut self, gain: f64, sd: f64) {
         self.evidence.tell(gain, sd);
         self.force.caution(gain, sd);

@@ -8,8 +8,8 @@ use crate::exposure::{Past, mean};
 pub(super) const LAGS: [f64; MEMBERS] = [-1.0, 0.0, 1.0, 2.0, 3.0];
 /// How many: any of the delays that are looked for, from any time between two ticks.
 pub(super) const MEMBERS: usize = 5;
-/// Fixes of a block, where a move of the dither takes a tick. Whitened binary dither is correlated with itself over 3 ticks; a block of five times that has all but a tenth of
-/// the correlation of neighbouring products.
+/// Fixes of a block, where a move of the dither takes a tick. Whitened binary dither is correlated with itself over 3 ticks; a block of
+/// five times that has all but a tenth of the correlation of neighbouring products.
 pub(super) const BLOCK: u32 = 16;
 
 /// Where the exposures are between the ticks.

@@ -16,8 +16,8 @@ const LEAST_SHARE: f64 = 0.3;
 const ROUNDS: usize = 3;
 
 impl Localiser {
-    /// Position of a bead at a place (px) where none was: unless the narrow window shows one now, nothing else is tried, which takes a
-    /// fifth of the time of [`Localiser::locate`].
+    /// Position of a bead at a place (px) where none was. Unless the narrow window shows one now, nothing else is tried:
+    /// [`Localiser::locate`] tries up to four times.
     pub(crate) fn locate_where_none_was(&mut self, frame: &Frame, place_px: (f64, f64)) -> Fix {
         let view = View::of(frame);
         let side_px = self.narrow_px().min(self.config.window_px);

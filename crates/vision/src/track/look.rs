@@ -28,15 +28,7 @@ impl Tracker {
         let ours = seen
             .filter_map(|(k, c)| c.filter(near).map(|c| (k, c)))
             .min_by(|a, b| away_px(&a.1).total_cmp(&away_px(&b.1)));
-        let field = self.field(frame);
-        self.neighbours.update(
-            &motion,
-            &self.candidates,
-            ours.map(|(k, _)| k),
-            time_s,
-            &self.config,
-            field,
-        );
+        self.update_neighbours(frame, &motion, ours.map(|(k, _)| k), time_s);
         if let Some((_, ours)) = ours {
             self.remember_beside(Some(&ours));
         }

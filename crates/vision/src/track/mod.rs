@@ -246,16 +246,18 @@ impl Tracker {
     ) -> (Decision, Option<Fix>) {
         let fix = (self.localiser).locate(frame, Some(chosen.motion.position()));
         let mut seen = Candidate::new(fix, self.localiser.relative_size(&fix));
-        if !self.is_predicted(&chosen, &seen) {
+        let mut stays = self.is_predicted(&chosen, &seen);
+        if !stays {
             self.look_around(frame, false, None);
             let away = |c: &Candidate| chosen.motion.distance2(&c.fix);
             let others = self.candidates.iter().flatten();
             if let Some(nearest) = others.min_by(|a, b| away(a).total_cmp(&away(b))) {
                 seen = *nearest;
+                stays = self.is_predicted(&chosen, &seen);
             }
         }
         let Candidate { fix, size, .. } = seen;
-        if self.is_predicted(&chosen, &seen) {
+        if stays {
             chosen.motion.update(&fix);
             chosen.identity.update(&fix, size);
             chosen.confirmed += 1;
@@ -365,15 +367,7 @@ impl Tracker {
             Some(Claim::Ours) => best,
             _ => None,
         };
-        let field = self.field(frame);
-        self.neighbours.update(
-            &chosen.motion,
-            &self.candidates,
-            taken,
-            time_s,
-            &self.config,
-            field,
-        );
+        self.update_neighbours(frame, &chosen.motion, taken, time_s);
         match (
             taken.and_then(|k| self.candidates.get(k).copied().flatten()),
             claim,

@@ -1,6 +1,7 @@
 //! Beads whose images overlap: what one template fits badly is fitted as several beads, and a flow carries them alike.
 
 use super::carried::STREAK_PX;
+use super::motion::Motion;
 use super::neighbours::{Candidate, Field, MAX_BEADS, is_sight};
 use super::{Chosen, Tracker};
 use crate::frame::Frame;
@@ -19,12 +20,20 @@ impl Tracker {
         TOUCHING_RADII * self.localiser.template().radius_px()
     }
 
-    pub(super) fn field(&self, frame: &Frame) -> Field {
-        Field {
+    /// Takes in the other beads of the candidates; the bead that moves as `ours` is the candidate `taken`.
+    pub(super) fn update_neighbours(
+        &mut self,
+        frame: &Frame,
+        ours: &Motion,
+        taken: Option<usize>,
+        time_s: f64,
+    ) {
+        let field = Field {
             width_px: frame.width,
             height_px: frame.height,
             touching_px: self.touching_px(),
-        }
+        };
+        (self.neighbours).update(ours, &self.candidates, taken, time_s, &self.config, field);
     }
 
     /// Locates every bead that the detector sees, those near each other together; with `carried` also as a step of the flow draws

@@ -40,8 +40,8 @@ struct Side {
 }
 
 impl Side {
-    /// Gain over the model's, as small as it may be, and none above the model's: a tick whose dither moves the bead by next to nothing may
-    /// seem to show any gain, and what it makes of the next tick would outweigh all others.
+    /// Gain over the model's, as small as it may be, and none above the model's. A tick whose dither moves the bead by next to nothing may
+    /// seem to show any gain. The next tick, judged by that gain, would outweigh all others.
     fn least_gain(&self, spread_um2: f64) -> f64 {
         if self.dithered_um2 <= 0.0 {
             return 0.0;
