@@ -10,7 +10,8 @@ use cellpos_rig::clock::Clock;
 use cellpos_rig::freshness::{FrameAccount, IdKind};
 use cellpos_rig::measurement::Measurement;
 use cellpos_rig::source::{
-    Camera, CameraError, FrameBuffer, FrameStamp, FrameWatch, PositionSource, SeenFrame, SourceInfo,
+    Camera, CameraError, FrameBuffer, FrameStamp, FrameWatch, PositionSource, Rejections,
+    SeenFrame, SourceInfo,
 };
 use cellpos_vision::{
     Cell, CellTracker, Commanded, Decision, Fix, FixQuality, Frame, TrackState, TrackStep, Tracker,
@@ -42,6 +43,13 @@ impl Followed {
         match self {
             Self::Bead(tracker) => tracker.choose(Some(aim_px)),
             Self::Cell(tracker) => tracker.choose(Some(aim_px)),
+        }
+    }
+
+    fn reject(&mut self) {
+        match self {
+            Self::Bead(tracker) => tracker.reject(),
+            Self::Cell(tracker) => tracker.reject(),
         }
     }
 
@@ -109,6 +117,9 @@ pub struct VisionSource<C> {
     calibration: Calibration,
     clock: Clock,
     flow: Option<CommandedFlow>,
+    rejections: Rejections,
+    /// How many of the rejections have been heard.
+    rejected: u32,
     buffer: FrameBuffer,
     /// The frame before.
     before: FrameBuffer,
@@ -165,6 +176,8 @@ impl<C: Camera> VisionSource<C> {
             calibration,
             clock,
             flow: None,
+            rejections: Rejections::default(),
+            rejected: 0,
             buffer: FrameBuffer::default(),
             before: FrameBuffer::default(),
             noise_free: false,
@@ -315,6 +328,10 @@ impl<C: Camera> VisionSource<C> {
 
 impl<C: Camera> PositionSource for VisionSource<C> {
     fn next(&mut self, deadline_ns: i64) -> Result<Option<Measurement>, CameraError> {
+        let rejected = self.rejections.count();
+        if std::mem::replace(&mut self.rejected, rejected) != rejected {
+            self.followed.reject();
+        }
         self.look_beside();
         let Some(stamp) = self.take(deadline_ns)? else {
             return Ok(None);
@@ -356,6 +373,10 @@ impl<C: Camera> PositionSource for VisionSource<C> {
 
     fn truth_um(&mut self) -> f64 {
         self.camera.truth_um()
+    }
+
+    fn rejections(&self) -> Option<Rejections> {
+        Some(self.rejections.clone())
     }
 
     fn info(&self) -> SourceInfo {

@@ -38,5 +38,5 @@ pub use freshness::{FrameAccount, FrameCounts, FrameKind, IdKind, Judged};
 pub use measurement::Measurement;
 pub use source::{
     Camera, CameraError, FrameBuffer, FrameStamp, FrameWatch, PictureScale, PositionSource,
-    SeenFrame, SourceInfo,
+    Rejections, SeenFrame, SourceInfo,
 };

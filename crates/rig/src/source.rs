@@ -3,6 +3,8 @@
 use crate::measurement::Measurement;
 use cellpos_vision::{Frame, Pixels};
 use serde::Serialize;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Data of a frame besides its pixels. Times are nanoseconds of the run's clock.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -182,6 +184,22 @@ pub trait FrameWatch: Send {
     fn frame(&mut self, seen: &SeenFrame<'_>);
 }
 
+/// The loop's word to a source that what it follows did not move with the PZT, so that it looks for another.
+#[derive(Debug, Clone, Default)]
+pub struct Rejections(Arc<AtomicU32>);
+
+impl Rejections {
+    /// Rejects what is followed now. Neither locks nor waits.
+    pub fn reject(&self) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// How often something was rejected.
+    pub fn count(&self) -> u32 {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
 /// A stream of bead positions.
 pub trait PositionSource: Send {
     /// Waits for the next position until `deadline_ns`; `None` when none came in time.
@@ -197,6 +215,11 @@ pub trait PositionSource: Send {
 
     /// Description of the source.
     fn info(&self) -> SourceInfo;
+
+    /// Where to reject what it follows; `None` if the source can follow nothing else.
+    fn rejections(&self) -> Option<Rejections> {
+        None
+    }
 
     /// Shows each new frame to `watch` from now on; `false` if the source has no frames.
     fn watch(&mut self, watch: Box<dyn FrameWatch>) -> bool {

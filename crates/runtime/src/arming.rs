@@ -9,6 +9,9 @@
 //! before. The variance of an increment grows with its time, as Brownian motion's does. Increments near a skipped tick, or near a command
 //! that came late or not at all, answer another pulse: they are left out. While the fit cannot decide, or refuses the plant after such a
 //! command, the pulse is made again. All pulses are fitted together, until the patience of arming ends.
+//!
+//! What does not move at all may be a bead on the glass, and another one the bead: it is left for another, which the pulse tries anew.
+//! If no other comes, or none of several moves, the plant is refused.
 
 use crate::life::Refusal;
 use cellpos_control::LoopModel;
@@ -115,6 +118,9 @@ pub struct ArmingState {
     unseen: u32,
     /// Ticks of the pulses before this one.
     spent: u32,
+    /// What the last one that did not move has shown, and how many there were.
+    unmoved: Option<GainCheck>,
+    rejected: u32,
     /// Tick of the pulse; `None` before it.
     pulse: Option<u32>,
     base_um: f64,
@@ -165,6 +171,8 @@ impl ArmingState {
 
 /// Ticks in a row without a frame that a steady bead may have where each tick has one.
 const MOST_SILENT: u32 = 3;
+/// Objects that are tried: as many as the tracker remembers. One that only gives positions is tried as often.
+const MOST_REJECTED: u32 = 8;
 /// Ticks without a position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
 /// How far it goes in a tick, um: 100 um/s at 1 kHz.
@@ -205,6 +213,8 @@ pub enum Step {
     Command(f64),
     /// The pulse leaves a doubt; hold this displacement, um, until the bead is steady again.
     Again(f64, GainCheck),
+    /// What is seen does not move; hold this displacement, um, until another one is steady.
+    Another(f64, GainCheck),
     /// The check is over.
     Done(GainCheck),
 }
@@ -312,7 +322,8 @@ impl Arming {
                 return Step::Command(command_um + state.way() * first_um);
             }
             if state.ticks > self.config.patience_ticks {
-                return Step::Done(GainCheck::unmeasured(Some(Refusal::NoBead)));
+                let none = GainCheck::unmeasured(Some(Refusal::NoBead));
+                return Step::Done(state.unmoved.unwrap_or(none));
             }
             if state.unseen <= UNSEEN_TICKS || !neutral_um.is_finite() {
                 return Step::Command(command_um);
@@ -333,6 +344,16 @@ impl Arming {
                 let verdict = self.judge(state);
                 let doubtful = !verdict.sure || state.unled_at.is_some();
                 let spent = state.spent.saturating_add(tick);
+                let unmoved = verdict.refusal == Some(Refusal::NoResponse) && !doubtful;
+                if unmoved && state.rejected < MOST_REJECTED {
+                    let base_um = state.base_um;
+                    *state = ArmingState {
+                        unmoved: Some(verdict),
+                        rejected: state.rejected + 1,
+                        ..ArmingState::default()
+                    };
+                    return Step::Another(base_um, verdict);
+                }
                 if verdict.refusal.is_none() || !doubtful || spent > self.config.patience_ticks {
                     return Step::Done(verdict);
                 }
@@ -340,6 +361,8 @@ impl Arming {
                 *state = ArmingState {
                     spent,
                     seen: state.seen,
+                    unmoved: state.unmoved,
+                    rejected: state.rejected,
                     ..ArmingState::default()
                 };
                 Step::Again(base_um, verdict)

@@ -91,7 +91,7 @@ fn arm(
         };
         match arming.step(&mut state, &input) {
             Step::Command(next) => command = next,
-            Step::Again(next, _) => {
+            Step::Again(next, _) | Step::Another(next, _) => {
                 command = next;
                 again += 1;
             }
@@ -239,6 +239,32 @@ fn late_ticks(cost: f64) -> Vec<Option<u32>> {
         free = (frame + 1.0).max(free + cost);
     }
     late
+}
+
+#[test]
+fn what_does_not_move_is_left_for_another_that_does_and_refused_if_none_comes() {
+    // One on the glass while the first pulse goes on; then none is seen; then the bead is.
+    for comes in [Some(450), None] {
+        let mut last = 0;
+        let seen = |tick: u32, um: f64| {
+            last = tick;
+            let bead = comes.is_some_and(|comes| tick >= comes).then_some(um);
+            let um = if tick < 50 { Some(3.0) } else { bead };
+            um.map(|um| due(um + jitter_um(tick)))
+        };
+        let (verdict, largest, again) =
+            arm(ArmingConfig::default(), DELAY, seen, |_| Time::default());
+        let (refusal, most) = match comes {
+            Some(comes) => (None, comes + 100),
+            None => (
+                Some(Refusal::NoResponse),
+                100 + ArmingConfig::default().patience_ticks,
+            ),
+        };
+        assert_eq!(verdict.refusal, refusal, "{verdict:?}");
+        assert!(last < most && again == 1, "{last} {again}");
+        assert_eq!(largest, 0.5);
+    }
 }
 
 #[test]
@@ -391,7 +417,7 @@ fn arm_in_brownian_motion(
             steps: 1,
         };
         match arming.step(&mut state, &input) {
-            Step::Command(next) | Step::Again(next, _) => command = next,
+            Step::Command(next) | Step::Again(next, _) | Step::Another(next, _) => command = next,
             Step::Done(check) => return (check, farthest),
         }
         plant.step(&mut truth, command - 20.0);

@@ -192,6 +192,13 @@ pub enum EventKind {
         /// Half width of its 95 % interval.
         ci95: f64,
     },
+    /// What was seen did not move with the PZT: another bead is looked for.
+    ArmingRejected {
+        /// Measured gain over the model's.
+        gain_ratio: f64,
+        /// Half width of its 95 % interval.
+        ci95: f64,
+    },
     /// The plant did not answer the pulse as the model says.
     ArmingRefused {
         /// Why.

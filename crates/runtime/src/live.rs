@@ -81,7 +81,13 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
     threads: &Threads,
     operator: &Arc<Operator>,
 ) -> Result<Finished<S>, RunError> {
-    let (ticker, ends) = Ticker::new(core, Clock::Real, monotonic_ns(), RingSizes::default());
+    let (ticker, ends) = Ticker::new(
+        core,
+        source.rejections(),
+        Clock::Real,
+        monotonic_ns(),
+        RingSizes::default(),
+    );
     let period_ns = ticker.core().frame_period_ns();
     let Ends {
         measurements,

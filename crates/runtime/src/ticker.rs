@@ -4,14 +4,14 @@ use crate::board_watch::{BoardTrouble, BoardWatch};
 use crate::core::{Action, Core, TickInput};
 use crate::frames::FrameWatch;
 use crate::latency::Latency;
-use crate::life::{Event, Life, Request};
+use crate::life::{Event, EventKind, Life, Request};
 use crate::reference::ReferenceGenerator;
 use crate::tick::Heard;
 use crate::tick_record::{TickFlags, TickRecord};
 use crate::timing::Timing;
 use cellpos_control::{LearnerState, SolverTerms};
 use cellpos_rig::clock::monotonic_ns;
-use cellpos_rig::{ActuatorReport, Clock, CommandAccount, Measurement, PartnerReport};
+use cellpos_rig::{ActuatorReport, Clock, CommandAccount, Measurement, PartnerReport, Rejections};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::time::{Duration, Instant};
 
@@ -102,6 +102,7 @@ pub struct Ticker<R> {
     heard: Consumer<Heard>,
     records: Producer<TickRecord>,
     events: Producer<Event>,
+    rejections: Option<Rejections>,
     learned: Producer<(u16, LearnerState)>,
     ticks: u64,
     previous_late_ns: Option<u32>,
@@ -120,8 +121,14 @@ pub struct Ticker<R> {
 }
 
 impl<R: ReferenceGenerator> Ticker<R> {
-    /// Puts rings around a core. `start_ns` is the start of the run on `clock`.
-    pub fn new(core: Core<R>, clock: Clock, start_ns: i64, sizes: RingSizes) -> (Self, Ends) {
+    /// Puts rings around a core. `rejections` is where the source of its positions hears that it follows no bead, `start_ns` the start of the run on `clock`.
+    pub fn new(
+        core: Core<R>,
+        rejections: Option<Rejections>,
+        clock: Clock,
+        start_ns: i64,
+        sizes: RingSizes,
+    ) -> (Self, Ends) {
         let (measurements_in, measurements) = RingBuffer::new(sizes.measurements.max(1));
         let (orders, orders_out) = RingBuffer::new(sizes.orders.max(1));
         let (heard_in, heard) = RingBuffer::new(64);
@@ -141,6 +148,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
             heard,
             records,
             events,
+            rejections,
             learned,
             ticks: 0,
             previous_late_ns: None,
@@ -304,6 +312,11 @@ impl<R: ReferenceGenerator> Ticker<R> {
         self.hand_over_record(record);
         self.account.events_lost += u64::from(output.events.lost);
         for event in output.events.iter() {
+            if let (EventKind::ArmingRejected { .. }, Some(followed)) =
+                (event.kind, &self.rejections)
+            {
+                followed.reject();
+            }
             if self.events.push(*event).is_err() {
                 self.account.events_lost += 1;
             }

@@ -150,6 +150,9 @@ fn text(kind: &EventKind) -> String {
             let why = refusal(why);
             format!("The arming pulse was disturbed and is made again ({why}).")
         }
+        EventKind::ArmingRejected { .. } => {
+            "What is seen did not move with the PZT: another bead is looked for.".to_string()
+        }
         EventKind::ArmingRefused {
             refusal: why,
             gain_ratio,

@@ -80,8 +80,12 @@ pub struct Scope {
 pub enum Role {
     /// In the chain, its numbers common to all records.
     Chain,
-    /// A line with amplitude and phase per record; the first parameter is its frequency, Hz.
-    Line,
+    /// A line, and its multiples up to a number of them in all, each with amplitude and phase per record; the first parameter is its
+    /// frequency, Hz.
+    Line {
+        /// How many, the line itself among them.
+        harmonics: usize,
+    },
     /// Periodic in position, sine and cosine common to all records; the first parameter is the period, um.
     Position,
 }

@@ -51,7 +51,7 @@ impl EffectKind for MainsHum {
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[Candidate {
             off_response: true,
-            role: Role::Line,
+            role: Role::Line { harmonics: 1 },
             ..Candidate::chain(&[lin("hz", 45.0, 65.0, 1e-3)])
         }];
         ALL

@@ -66,8 +66,8 @@ pub(crate) struct Fit {
     pub gain: f64,
     /// Standard errors of `soft` and `gain`.
     pub errors: [f64; 2],
-    /// Sine and cosine of each line in each record \[um\].
-    pub lines: Vec<Vec<[f64; 2]>>,
+    /// Sine and cosine of each line in each record, and of its multiples \[um\].
+    pub lines: Vec<Vec<Vec<[f64; 2]>>>,
     /// Sine and cosine of each position-periodic error \[um\].
     pub positions: Vec<[f64; 2]>,
     /// Those errors by the exact filter, once they are looked at so closely: by part.
@@ -97,9 +97,25 @@ impl Fit {
             .sum()
     }
 
-    /// The parts that act in one way, in their order.
-    pub(crate) fn of_role(&self, role: Role) -> impl Iterator<Item = &Part> {
-        self.parts.iter().filter(move |p| p.variant().role == role)
+    /// How many parts before this one act in the way that it does.
+    pub(crate) fn nth_of_role(&self, index: usize) -> usize {
+        let of = |part: &Part| std::mem::discriminant(&part.variant().role);
+        let before = &self.parts[..index];
+        before
+            .iter()
+            .filter(|p| of(p) == of(&self.parts[index]))
+            .count()
+    }
+
+    /// The parts that are lines, in their order.
+    pub(crate) fn line_parts(&self) -> impl Iterator<Item = &Part> {
+        let is_line = |p: &&Part| matches!(p.variant().role, Role::Line { .. });
+        self.parts.iter().filter(is_line)
+    }
+
+    /// The parts that are periodic in position, in their order.
+    pub(crate) fn position_parts(&self) -> impl Iterator<Item = &Part> {
+        (self.parts.iter()).filter(|p| p.variant().role == Role::Position)
     }
 
     /// Whether a part is a limit of its form: one of its numbers is at the end of its range, or may have any value in it.
@@ -139,7 +155,7 @@ pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
     v.params.len()
         + match v.role {
             Role::Chain => 0,
-            Role::Line => 2 * records,
+            Role::Line { harmonics } => 2 * harmonics * records,
             Role::Position => 2,
         }
 }

@@ -134,10 +134,11 @@ impl Context<'_> {
         until: Until,
     ) -> Fit {
         let records = self.problem.records.len();
-        let lines = parts
-            .iter()
-            .filter(|p| p.variant().role == Role::Line)
-            .count();
+        let lines = parts.iter().filter_map(|p| match p.variant().role {
+            Role::Line { harmonics } => Some(vec![vec![[0.0; 2]; harmonics]; records]),
+            _ => None,
+        });
+        let lines = lines.collect();
         let positions = parts
             .iter()
             .filter(|p| p.variant().role == Role::Position)
@@ -148,7 +149,7 @@ impl Context<'_> {
             offset_um: 0.0,
             gain: 1.0,
             errors: [0.0; 2],
-            lines: vec![vec![[0.0; 2]; records]; lines],
+            lines,
             positions: vec![[0.0; 2]; positions],
             locking: Vec::new(),
             chi2: 0.0,
@@ -272,15 +273,15 @@ impl Context<'_> {
                         next += 1;
                     }
                 }
-                Role::Line => {
+                Role::Line { harmonics } => {
                     let p = &v.params[0];
                     part.theta[0] =
                         p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
-                    for i in 0..records {
-                        t.lines[line][i][0] += step[next + 1 + 2 * i];
-                        t.lines[line][i][1] += step[next + 2 + 2 * i];
+                    let waves = t.lines[line].iter_mut().flatten().flatten();
+                    for (x, step) in waves.zip(step.iter().skip(next + 1)) {
+                        *x += step;
                     }
-                    next += 1 + 2 * records;
+                    next += 1 + 2 * harmonics * records;
                     line += 1;
                 }
                 Role::Position => {

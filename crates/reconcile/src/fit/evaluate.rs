@@ -63,17 +63,19 @@ impl Context<'_> {
             for (e, edge) in e.iter_mut().zip(&edges[i]) {
                 *e -= fit.soft * edge;
             }
-            for (p, amplitudes) in fit.of_role(Role::Line).zip(&fit.lines) {
-                let [a, b] = amplitudes[i];
-                if a != 0.0 || b != 0.0 {
-                    self.rotate(p.natural()[0], e.len(), |k, sin, cos| {
-                        let line = a * sin + b * cos;
-                        e[k] -= line;
-                        s[k] += line;
-                    });
+            for (p, amplitudes) in fit.line_parts().zip(&fit.lines) {
+                for (harmonic, [a, b]) in (1..).zip(&amplitudes[i]) {
+                    if *a != 0.0 || *b != 0.0 {
+                        let hz = f64::from(harmonic) * p.natural()[0];
+                        self.rotate(hz, e.len(), |k, sin, cos| {
+                            let line = a * sin + b * cos;
+                            e[k] -= line;
+                            s[k] += line;
+                        });
+                    }
                 }
             }
-            for (p, [a, b]) in fit.of_role(Role::Position).zip(&fit.positions) {
+            for (p, [a, b]) in fit.position_parts().zip(&fit.positions) {
                 if *a == 0.0 && *b == 0.0 {
                     continue;
                 }
@@ -113,6 +115,47 @@ impl Context<'_> {
         }
     }
 
+    /// Columns of a line: of its frequency, which is common, then sine and cosine of each multiple, which are each record's own. The
+    /// next free place.
+    fn add_line_columns(
+        &self,
+        part: &Part,
+        waves: &[Vec<[f64; 2]>],
+        mask: &Mask,
+        first: usize,
+        columns: &mut [Columns],
+    ) -> usize {
+        let hz = part.natural()[0];
+        let mut next = first + 1;
+        for (i, (r, waves)) in self.problem.records.iter().zip(waves).enumerate() {
+            let n = r.u.len();
+            let mut whitened = |at: usize, d: &[f64]| {
+                let mut w = vec![0.0; n];
+                r.whiten(d, &mut w);
+                columns[i].push((at, w));
+            };
+            let counted = !mask[i].is_empty();
+            let mut of_hz = vec![0.0; n];
+            for (times, [a, b]) in (1_u32..).map(f64::from).zip(waves) {
+                if counted {
+                    let (mut of_a, mut of_b) = (vec![0.0; n], vec![0.0; n]);
+                    self.rotate(times * hz, n, |k, s, c| {
+                        let time_s = k as f64 * self.problem.base.sample_s;
+                        of_hz[k] -= TAU * times * time_s * (a * c - b * s);
+                        (of_a[k], of_b[k]) = (-s, -c);
+                    });
+                    whitened(next, &of_a);
+                    whitened(next + 1, &of_b);
+                }
+                next += 2;
+            }
+            if of_hz.iter().any(|d| *d != 0.0) {
+                whitened(first, &of_hz);
+            }
+        }
+        next
+    }
+
     /// Whitened derivative columns of the innovations at a state.
     pub(crate) fn columns(&self, fit: &Fit, state: &State, mask: &Mask) -> (usize, Vec<Columns>) {
         let records = &self.problem.records;
@@ -139,29 +182,8 @@ impl Context<'_> {
                         next += 1;
                     }
                 }
-                Role::Line => {
-                    let hz = part.natural()[0];
-                    for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
-                        let n = r.u.len();
-                        let [a, b] = fit.lines[line][i];
-                        let mut d = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
-                        self.rotate(hz, n, |k, s, c| {
-                            d[0][k] =
-                                -TAU * k as f64 * self.problem.base.sample_s * (a * c - b * s);
-                            d[1][k] = -s;
-                            d[2][k] = -c;
-                        });
-                        for (j, d) in d.iter().enumerate() {
-                            let mut w = vec![0.0; n];
-                            r.whiten(d, &mut w);
-                            // Frequency is common; sine and cosine are this record's own.
-                            let at = if j == 0 { next } else { next + 2 * i + j };
-                            if j > 0 || a != 0.0 || b != 0.0 {
-                                columns[i].push((at, w));
-                            }
-                        }
-                    }
-                    next += 1 + 2 * records.len();
+                Role::Line { .. } => {
+                    next = self.add_line_columns(part, &fit.lines[line], mask, next, &mut columns);
                     line += 1;
                 }
                 Role::Position => {

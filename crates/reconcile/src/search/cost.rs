@@ -4,7 +4,7 @@ use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::problem::Mask;
 use crate::thresholds::{CHANCE, CHANCE_SD, NUMBER, THRESHOLDS};
-use cellpos_plant::effects::{Action, Candidate, Role};
+use cellpos_plant::effects::{Action, Candidate};
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
 fn chi2_quantile(k: f64, z: f64) -> f64 {
@@ -79,7 +79,7 @@ pub(crate) fn scatter(n: f64) -> f64 {
 /// What a set must close to count as whole. Positions are known only within the noise where a pixel's error is steep: an error
 /// periodic in position never closes altogether.
 fn whole(fit: &Fit) -> f64 {
-    if fit.of_role(Role::Position).next().is_some() {
+    if fit.position_parts().next().is_some() {
         THRESHOLDS.closed_least
     } else {
         THRESHOLDS.closed_whole

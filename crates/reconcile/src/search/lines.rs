@@ -1,11 +1,14 @@
 //! A line in the residual of a fit, with a separate amplitude and phase in every record.
 
 use crate::dot::dot;
+use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
 use crate::search::cost::threshold_of_waves;
 use crate::search::suspect::line_score;
 use crate::thresholds::THRESHOLDS;
+use cellpos_plant::effects::Role;
+use realfft::RealFftPlanner;
 use std::f64::consts::TAU;
 
 /// What a line leaves over.
@@ -48,6 +51,54 @@ pub(crate) fn without_line(ctx: &Context<'_>, fit: &Fit, hz: f64, train: &Mask) 
         left,
     })
 }
+
+/// Where a fit of a line, or of one with its multiples, begins: at the most power in the spectrum of the innovations. `None` for a
+/// candidate of another kind.
+///
+/// The filter is the same for neighbouring frequencies, so that it divides out of the gain of a line.
+pub(crate) fn line_scan(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    variant: Variant,
+    mask: &Mask,
+) -> Option<Part> {
+    let candidate = variant.candidate();
+    let (Role::Line { harmonics }, [hz]) = (candidate.role, candidate.params) else {
+        return None;
+    };
+    let rows = fit.innovations.iter().map(Vec::len).max()?;
+    let bins = (4 * rows).next_power_of_two();
+    let plan = RealFftPlanner::<f64>::new().plan_fft_forward(bins);
+    let mut transform = plan.make_output_vec();
+    let mut power = vec![0.0; transform.len()];
+    for (e, ranges) in fit.innovations.iter().zip(mask) {
+        let mut counted = vec![0.0; bins];
+        for range in ranges {
+            counted[range.clone()].copy_from_slice(&e[range.clone()]);
+        }
+        let count: usize = ranges.iter().map(std::ops::Range::len).sum();
+        plan.process(&mut counted, &mut transform).ok()?;
+        for (power, x) in power.iter_mut().zip(&transform) {
+            *power += 2.0 * x.norm_sqr() / count.max(1) as f64;
+        }
+    }
+    // Fine enough for the highest multiple.
+    let step_hz = 1.0 / (bins as f64 * ctx.problem.base.sample_s * harmonics as f64);
+    let gain = |m: usize| -> f64 {
+        let at = |times: usize| power.get((times * m + harmonics / 2) / harmonics);
+        (1..=harmonics).filter_map(at).sum()
+    };
+    let (from, to) = ((hz.lower / step_hz) as usize, (hz.upper / step_hz) as usize);
+    let gains: Vec<f64> = (from..=to).map(gain).collect();
+    let most = gains.iter().copied().fold(0.0, f64::max);
+    // A line's halves and thirds have it among their multiples.
+    let best = gains.iter().rposition(|gain| *gain >= SAME * most)?;
+    let best = (from + best) as f64 * step_hz;
+    Some(Part::new(variant, &[best]))
+}
+
+/// Share of the most gain at which two frequencies gain the same.
+const SAME: f64 = 0.98;
 
 /// The frequency of the strongest line in the innovations that is on no line of the command, if any stands out.
 pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {

@@ -7,8 +7,9 @@ use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::Mask;
+use crate::search::lines::line_scan;
 use crate::search::pixel::pixel_scan;
-use crate::search::suspect::{Suspect, line_score};
+use crate::search::suspect::{Suspect, lines_score};
 use cellpos_plant::effects::Role;
 
 /// The best start of every variant not excluded, best first.
@@ -24,11 +25,12 @@ pub(crate) fn screen(
     for v in &ctx.variants {
         if allowed(*v) && v.candidate().role != Role::Position {
             jobs.extend(v.starts(&ctx.scope));
+            jobs.extend(line_scan(ctx, fit, *v, mask));
         }
     }
     let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
     let scores = cellpos_numeric::parallel::map(&jobs, threads, |part| match part.variant().role {
-        Role::Line => line_score(ctx, fit, part.natural()[0], mask),
+        Role::Line { .. } => lines_score(ctx, fit, part, mask),
         _ => {
             let mut parts = fit.parts.clone();
             parts.push(part.clone());

@@ -4,6 +4,7 @@ use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
+use cellpos_plant::effects::Role;
 use std::f64::consts::TAU;
 
 /// One candidate that may be worth a fit.
@@ -23,6 +24,16 @@ pub(crate) fn pair_score(s: &[f64], c: &[f64], e: &[f64]) -> f64 {
         return 0.0;
     }
     (cc * se * se - 2.0 * sc * se * ce + ss * ce * ce) / det
+}
+
+/// Gain of a line of a frequency, and of its multiples, with their own amplitudes and phases in every record.
+pub(crate) fn lines_score(ctx: &Context<'_>, fit: &Fit, part: &Part, mask: &Mask) -> f64 {
+    let Role::Line { harmonics } = part.variant().role else {
+        return 0.0;
+    };
+    let hz = part.natural()[0];
+    let of = |times: usize| line_score(ctx, fit, times as f64 * hz, mask);
+    (1..=harmonics).map(of).sum()
 }
 
 /// Gain of a line of a frequency with its own amplitude and phase in every record.

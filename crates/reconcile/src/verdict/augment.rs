@@ -3,6 +3,7 @@
 use crate::data::floor::Floor;
 use crate::data::frames::FrameCounts;
 use crate::fit::context::{Context, Fit};
+use crate::problem::Prepared;
 use crate::simulate::near_whole;
 use crate::units::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
@@ -32,12 +33,6 @@ fn without_edge(ctx: &Context<'_>, fit: &Fit, delay_s: f64) -> f64 {
 fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
     let part = &fit.parts[index];
     let v = part.natural();
-    let before = |role| {
-        fit.parts[..index]
-            .iter()
-            .filter(|p| p.variant().role == role)
-            .count()
-    };
     match part.variant().role {
         Role::Chain => {
             let effect = part.effect(&ctx.scope);
@@ -48,30 +43,36 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
             whole.theta[0] = part.variant().params[0].coordinate(without_edge(ctx, fit, delay_s));
             Some(whole.effect(&ctx.scope))
         }
-        Role::Line => {
-            let line = &fit.lines[before(Role::Line)];
-            let [a, b] = line.first().copied()?;
-            let rows: f64 = ctx.problem.records.iter().map(|r| r.u.len() as f64).sum();
-            let um = ctx
-                .problem
-                .records
-                .iter()
-                .zip(line)
-                .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
-                .sum::<f64>()
-                / rows;
+        Role::Line { harmonics } => {
+            let line = &fit.lines[fit.nth_of_role(index)];
+            let [a, b] = line.first()?.first().copied()?;
+            let records = &ctx.problem.records;
+            let rows: f64 = records.iter().map(|r| r.u.len() as f64).sum();
+            let mean_um = |harmonic: usize| -> f64 {
+                let of = |(r, waves): (&Prepared, &Vec<[f64; 2]>)| {
+                    let [a, b] = waves.get(harmonic).copied().unwrap_or_default();
+                    a.hypot(b) * r.u.len() as f64
+                };
+                records.iter().zip(line).map(of).sum::<f64>() / rows
+            };
+            let um = mean_um(0);
             // Amplitude and phase are no parameters of the fit: the form of the effect has them in addition to the frequency.
-            part.effect(&ctx.scope)
-                .with_parameter("um", um)
-                .and_then(|e| e.with_parameter("phase_deg", b.atan2(a).to_degrees()))
-                .ok()
+            let effect = part.effect(&ctx.scope).with_parameter("um", um);
+            let effect =
+                effect.and_then(|e| e.with_parameter("phase_deg", b.atan2(a).to_degrees()));
+            if harmonics > 1 && um > 0.0 {
+                return effect
+                    .and_then(|e| e.with_parameter("second", mean_um(1) / um))
+                    .ok();
+            }
+            effect.ok()
         }
         Role::Position => {
             let exact = fit.locking.get(index).copied().flatten();
             let ([a, b], pixel_um, amplitude) = match exact {
                 Some(l) => (l.wave_um, l.pixel_um, l.amplitude_px().0),
                 None => {
-                    let [a, b] = fit.positions[before(Role::Position)];
+                    let [a, b] = fit.positions[fit.nth_of_role(index)];
                     let sharp = ctx.problem.noise.sharpness(v[0]);
                     ([a, b], v[0], a.hypot(b) / (v[0] * sharp))
                 }

@@ -67,19 +67,24 @@ pub(crate) fn parameters(
             },
         );
     }
-    let nth = |role| {
-        fit.parts[..index]
-            .iter()
-            .filter(|p| p.variant().role == role)
-            .count()
-    };
     match part.variant().role {
-        Role::Line => {
-            let um = line_um(ctx, part, &fit.lines[nth(Role::Line)]);
+        Role::Line { harmonics } => {
+            let line = &fit.lines[fit.nth_of_role(index)];
+            let um = wave_um(ctx, part, line, 1);
+            if harmonics > 1 && um.value > 0.0 {
+                let of_second = wave_um(ctx, part, line, 2);
+                let share = |um_: f64| um_ / um.value;
+                let second = Interval {
+                    value: share(of_second.value),
+                    ci95: of_second.ci95.map(share),
+                    unit: String::new(),
+                };
+                out.insert("second".to_owned(), second);
+            }
             out.insert("um".to_owned(), um);
         }
         Role::Position => {
-            out.extend(wave_of_position(ctx, fit, index, nth(Role::Position)));
+            out.extend(wave_of_position(ctx, fit, index, fit.nth_of_role(index)));
         }
         Role::Chain => {}
     }
@@ -120,17 +125,19 @@ fn about(value: f64, sd: f64, unit: &str) -> Interval {
 }
 
 /// Amplitude of a line: the mean over the records, by their rows.
-fn line_um(ctx: &Context<'_>, part: &Part, line: &[[f64; 2]]) -> Interval {
+/// Mean amplitude of a line at `times` its frequency.
+fn wave_um(ctx: &Context<'_>, part: &Part, line: &[Vec<[f64; 2]>], times: usize) -> Interval {
     let records = &ctx.problem.records;
     let rows: f64 = records.iter().map(|r| r.u.len() as f64).sum();
     let mean = records
         .iter()
         .zip(line)
-        .map(|(r, [a, b])| a.hypot(*b) * r.u.len() as f64)
+        .filter_map(|(r, waves)| waves.get(times - 1).map(|[a, b]| (r, a.hypot(*b))))
+        .map(|(r, um)| um * r.u.len() as f64)
         .sum::<f64>()
         / rows;
     // One record's amplitude has the error sigma sqrt(2/n) over the filter's gain at the line.
-    let w = std::f64::consts::TAU * part.natural()[0] * ctx.problem.base.sample_s;
+    let w = std::f64::consts::TAU * times as f64 * part.natural()[0] * ctx.problem.base.sample_s;
     let theta = ctx.problem.noise.white_um2 / ctx.problem.noise.innovation_um().powi(2);
     let gain = (2.0 * (w / 2.0).sin()) / (1.0 + theta * theta - 2.0 * theta * w.cos()).sqrt();
     let sd = ctx.problem.noise.innovation_um() * (2.0 / rows).sqrt() / gain.max(1e-6);

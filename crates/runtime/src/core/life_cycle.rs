@@ -139,6 +139,13 @@ impl<R: ReferenceGenerator> Core<R> {
         };
         match self.arming.step(&mut self.state.arming, &told) {
             Step::Command(command_um) => return Some(Mode::Direct(command_um)),
+            Step::Another(command_um, verdict) => {
+                tick.event(EventKind::ArmingRejected {
+                    gain_ratio: verdict.gain_ratio,
+                    ci95: verdict.ci95(),
+                });
+                return Some(Mode::Direct(command_um));
+            }
             Step::Again(command_um, verdict) => {
                 if let Some(refusal) = verdict.refusal {
                     tick.event(EventKind::ArmingRepeated {

@@ -278,7 +278,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
         ..RingSizes::default()
     };
     let core = core(reference, stands_um).counted_from(faults.first.0);
-    let (ticker, ends) = Ticker::new(core, control_clock.clone(), start_ns, sizes);
+    let (ticker, ends) = Ticker::new(core, None, control_clock.clone(), start_ns, sizes);
     let (seen_in, seen) = RingBuffer::new(1024);
     let mut sink = sink(faults, start_ns, recorder_clock);
     let mut statistics = Statistics::default();

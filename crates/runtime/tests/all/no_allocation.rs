@@ -13,6 +13,7 @@ fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
     let clock = Clock::virtual_at(0);
     let (mut ticker, mut ends) = Ticker::new(
         core(&controller(kind), false),
+        None,
         clock.clone(),
         0,
         RingSizes::default(),

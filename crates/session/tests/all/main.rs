@@ -9,3 +9,4 @@ mod rig_keys;
 mod rig_schema;
 mod rig_walk;
 mod session;
+mod still_beads;

@@ -95,6 +95,14 @@ impl CellTracker {
         self.standing.state = TrackState::Searching;
     }
 
+    /// Says that what is followed is no cell in the flow: it did not move with the PZT. It is not chosen again where it stands.
+    pub fn reject(&mut self) {
+        if let Some(chosen) = self.chosen {
+            self.stays.add(&chosen.cell);
+            self.choose(self.aim);
+        }
+    }
+
     /// Takes in the frame exposed about `time_s`, with what was commanded since the frame before. Without a frame, or with a
     /// time that has not moved on, the prediction is carried on.
     ///

@@ -15,6 +15,7 @@ mod identity;
 mod look;
 mod motion;
 mod neighbours;
+mod rejected;
 mod standing;
 mod stays;
 mod touching;
@@ -30,6 +31,7 @@ pub use config::{Commanded, Decision, TrackState, TrackStep, TrackerConfig};
 use identity::Identity;
 use motion::{Motion, Randomness};
 use neighbours::{Candidate, Claim, MAX_BEADS, Neighbours};
+use rejected::Rejected;
 use standing::{Chosen as Sighted, Standing};
 
 /// Frames between measurements of the size while tracking.
@@ -72,6 +74,7 @@ pub struct Tracker {
     beside: Beside,
     /// A look beside the bead, which was taken without it.
     owed: Option<Owed>,
+    rejected: Rejected,
     /// Share of what may be that the last fixes have used, and whether the end is near.
     used: f64,
     near_limit: bool,
@@ -100,6 +103,7 @@ impl Tracker {
             candidates: [None; MAX_BEADS],
             beside: Beside::default(),
             owed: None,
+            rejected: Rejected::default(),
             used: 0.0,
             near_limit: false,
         })
@@ -124,6 +128,14 @@ impl Tracker {
         self.beside = Beside::default();
         self.owed = None;
         self.standing.state = TrackState::Searching;
+    }
+
+    /// Says that what is followed is no free bead: it did not move with the PZT. It is not chosen again where it stands.
+    pub fn reject(&mut self) {
+        if let Some(chosen) = self.chosen {
+            self.rejected.add(chosen.motion.position());
+            self.choose(self.aim);
+        }
     }
 
     /// Takes in the frame exposed about `time_s`, with what was commanded: a flow velocity since the frame before (px/s), or
@@ -218,16 +230,19 @@ impl Tracker {
             .iter()
             .flatten()
             .filter(|c| c.fix.verdict == FixQuality::Good);
+        let apart_px = self.apart_px();
         let best = good
+            .filter(|c| !self.rejected.holds(&c.fix, apart_px))
             .min_by(|a, b| distance(a).total_cmp(&distance(b)))
             .copied();
         self.remember_beside(best.as_ref());
         let Some(best) = best else {
             let seen = self.candidates.iter().flatten().next().map(|c| c.fix);
-            return (
-                seen.map_or(Decision::NothingFound, |f| refusal(f.verdict)),
-                seen,
-            );
+            let decision = |fix: Fix| match fix.verdict {
+                FixQuality::Good => Decision::Stays,
+                verdict => refusal(verdict),
+            };
+            return (seen.map_or(Decision::NothingFound, decision), seen);
         };
         self.chosen = Some(Chosen {
             motion: Motion::new(&best.fix),
@@ -342,7 +357,8 @@ impl Tracker {
             }
             let mut ok = c.fix.verdict == FixQuality::Good && self.looks_like(&chosen, c, alone);
             // A lost bead may come back anywhere; a coasting one where the flow can have carried it.
-            ok &= self.standing.state == TrackState::Lost
+            ok &= (self.standing.state == TrackState::Lost
+                && !self.rejected.holds(&c.fix, self.apart_px()))
                 || self.within_reach(&chosen.motion, &c.fix);
             let cost = |i| {
                 self.neighbours
@@ -456,21 +472,6 @@ impl Tracker {
         let (x, y) = motion.way_to(fix);
         f64::hypot(x, y) <= self.config.fastest_flow_px_per_s * motion.since_s()
             || self.within_gate(motion, fix)
-    }
-
-    /// Adds a candidate unless one is already there.
-    fn add_candidate(&mut self, c: Candidate) {
-        let apart_px = 0.5 * self.localiser.template().radius_px();
-        let good = |c: &Candidate| c.fix.verdict == FixQuality::Good;
-        let same =
-            |o: &Candidate| f64::hypot(o.fix.x_px - c.fix.x_px, o.fix.y_px - c.fix.y_px) < apart_px;
-        if let Some(other) = self.candidates.iter_mut().flatten().find(|o| same(o)) {
-            if good(&c) && !good(other) {
-                *other = c;
-            }
-        } else if let Some(free) = self.candidates.iter_mut().find(|s| s.is_none()) {
-            *free = Some(c);
-        }
     }
 }
 

@@ -30,6 +30,13 @@ pub(crate) struct Randomness {
 }
 
 impl Randomness {
+    /// Of what stands on the glass: a stage drifts and trembles by some tenths of a pixel in a second.
+    pub(super) const GLASS: Self = Randomness {
+        diffusion_px2_per_s: 0.05,
+        velocity_walk: 0.0,
+        flow_error: 0.0,
+    };
+
     pub(super) fn of(config: &TrackerConfig) -> Self {
         Randomness {
             diffusion_px2_per_s: config.diffusion_px2_per_s,
@@ -149,6 +156,13 @@ impl Motion {
             y: Axis::new(fix.y_px, ry),
             since_s: 0.0,
         }
+    }
+
+    /// Of what has no velocity.
+    pub(super) fn standing(fix: &Fix) -> Self {
+        let mut motion = Motion::new(fix);
+        (motion.x.vv, motion.y.vv) = (0.0, 0.0);
+        motion
     }
 
     pub(super) fn predict(

@@ -61,6 +61,11 @@ struct Neighbour {
     motion: Motion,
     /// From the chosen bead to it. A flow, however it steps, carries both.
     apart: Motion,
+    /// Where it is if it stands on the glass, by how much more likely the fixes so far are if it does (twice the logarithm), and whether
+    /// that is sure.
+    stand: Motion,
+    stands: f64,
+    is_standing: bool,
     amplitude: f64,
     seen_s: f64,
     /// Frames in which it was seen.
@@ -93,19 +98,57 @@ impl Neighbour {
         self.sights >= config.confirm_frames
     }
 
+    fn new(own: &Fix, c: &Candidate, time_s: f64) -> Self {
+        Neighbour {
+            motion: Motion::new(&c.fix),
+            apart: Motion::new(&between(own, &c.fix)),
+            stand: Motion::standing(&c.fix),
+            stands: 0.0,
+            is_standing: false,
+            amplitude: c.fix.amplitude,
+            seen_s: time_s,
+            sights: 1,
+            sight: Sight::Seen,
+        }
+    }
+
+    /// Weighs whether it stands: a free bead is nowhere as still as one on the glass, and goes with the flow.
+    fn weigh(&mut self, swims: f64, fix: &Fix, certainty: f64) {
+        let stands = self.stand.quiet_cost(fix);
+        // What comes loose is known within a few sights.
+        self.stands = (self.stands + swims - stands).clamp(-certainty, 2.0 * certainty);
+        self.is_standing = self.stands > if self.is_standing { 0.0 } else { certainty };
+        if self.stands > -certainty {
+            self.stand.update(fix);
+        } else {
+            self.stand = Motion::standing(fix);
+        }
+    }
+
     /// Its motion where the chosen bead is as `ours` says: whichever is known better, its own or the way between them.
     fn beside(&self, ours: &Motion) -> Motion {
-        let carried = self.carried_with(ours);
+        if self.is_standing {
+            return self.stand;
+        }
+        self.swims_beside(ours)
+    }
+
+    /// The same by the way between them alone: a flow that steps carries both.
+    fn carried_with(&self, ours: &Motion) -> Motion {
+        if self.is_standing {
+            return self.stand;
+        }
+        ours.plus(&self.apart)
+    }
+
+    /// Its motion if it swims.
+    fn swims_beside(&self, ours: &Motion) -> Motion {
+        let carried = ours.plus(&self.apart);
         if carried.sd_px() < self.motion.sd_px() {
             carried
         } else {
             self.motion
         }
-    }
-
-    /// The same by the way between them alone: a flow that steps carries both.
-    fn carried_with(&self, ours: &Motion) -> Motion {
-        ours.plus(&self.apart)
     }
 }
 
@@ -150,6 +193,7 @@ impl Neighbours {
         for n in self.beads.iter_mut().flatten() {
             n.motion.predict(dt_s, flow_px_per_s, randomness);
             n.apart.predict(dt_s, (0.0, 0.0), &between);
+            n.stand.predict(dt_s, (0.0, 0.0), &Randomness::GLASS);
         }
     }
 
@@ -298,6 +342,8 @@ impl Neighbours {
                 n.sight = if alone { Sight::Gone } else { Sight::Hidden };
             }
             if let Some(c) = sight.and_then(|k| candidates.get(k)?.as_ref()) {
+                let swims = n.swims_beside(&known).surprise(&c.fix);
+                n.weigh(swims, &c.fix, config.certainty);
                 n.motion.update(&c.fix);
                 if let Some(own) = &taken_fix {
                     n.apart.update(&between(own, &c.fix));
@@ -332,14 +378,7 @@ impl Neighbours {
                 && is_sight(&c.fix)
                 && let Some(free) = self.beads.iter_mut().find(|n| n.is_none())
             {
-                *free = Some(Neighbour {
-                    motion: Motion::new(&c.fix),
-                    apart: Motion::new(&between(&own, &c.fix)),
-                    amplitude: c.fix.amplitude,
-                    seen_s: time_s,
-                    sights: 1,
-                    sight: Sight::Seen,
-                });
+                *free = Some(Neighbour::new(&own, c, time_s));
             }
         }
     }

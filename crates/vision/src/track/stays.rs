@@ -36,6 +36,19 @@ pub(super) struct Stays {
 }
 
 impl Still {
+    fn new(cell: &Cell, followed_px: Option<(f64, f64)>) -> Self {
+        Still {
+            x_px: cell.x_px,
+            y_px: cell.y_px,
+            width_px: cell.axes_px().1.max(1.0),
+            frames: 1,
+            unseen: 0,
+            carried_px: (0.0, 0.0),
+            followed_px,
+            passed: false,
+        }
+    }
+
     fn is(&self, cell: &Cell) -> bool {
         f64::hypot(self.x_px - cell.x_px, self.y_px - cell.y_px) <= PLACE * self.width_px
     }
@@ -78,22 +91,28 @@ impl Stays {
                 still.unseen = 0;
                 continue;
             }
-            let oldest = |slot: &Option<Still>| slot.map_or(u32::MAX, |still| still.unseen);
-            let Some(slot) = self.still.iter_mut().max_by_key(|slot| oldest(slot)) else {
+            let Some(slot) = self.oldest() else {
                 continue;
             };
             if slot.is_none_or(|still| still.unseen > 0) {
-                *slot = Some(Still {
-                    x_px: cell.x_px,
-                    y_px: cell.y_px,
-                    width_px: cell.axes_px().1.max(1.0),
-                    frames: 1,
-                    unseen: 0,
-                    carried_px: (0.0, 0.0),
-                    followed_px: place,
-                    passed: false,
-                });
+                *slot = Some(Still::new(cell, place));
             }
+        }
+    }
+
+    /// The slot that was not seen for longest, or a free one.
+    fn oldest(&mut self) -> Option<&mut Option<Still>> {
+        (self.still.iter_mut()).max_by_key(|slot| slot.map_or(u32::MAX, |still| still.unseen))
+    }
+
+    /// Takes in that a cell did not move with the PZT.
+    pub(super) fn add(&mut self, cell: &Cell) {
+        if let Some(slot) = self.oldest() {
+            *slot = Some(Still {
+                frames: FRAMES,
+                passed: true,
+                ..Still::new(cell, None)
+            });
         }
     }
 

@@ -4,6 +4,7 @@ use super::carried::STREAK_PX;
 use super::motion::Motion;
 use super::neighbours::{Candidate, Field, MAX_BEADS, is_sight};
 use super::{Chosen, Tracker};
+use crate::fix::FixQuality;
 use crate::frame::Frame;
 use crate::joint::MOST_TOGETHER;
 use crate::localiser::{Start, Together};
@@ -98,7 +99,28 @@ impl Tracker {
             };
             self.add_candidate(candidate);
         }
+        self.rejected.see(&self.candidates, self.apart_px());
         all_seen
+    }
+
+    /// Distance below which two fixes are of one object, px.
+    pub(super) fn apart_px(&self) -> f64 {
+        0.5 * self.localiser.template().radius_px()
+    }
+
+    /// Adds a candidate unless one is already there.
+    pub(super) fn add_candidate(&mut self, c: Candidate) {
+        let apart_px = self.apart_px();
+        let good = |c: &Candidate| c.fix.verdict == FixQuality::Good;
+        let same =
+            |o: &Candidate| f64::hypot(o.fix.x_px - c.fix.x_px, o.fix.y_px - c.fix.y_px) < apart_px;
+        if let Some(other) = self.candidates.iter_mut().flatten().find(|o| same(o)) {
+            if good(&c) && !good(other) {
+                *other = c;
+            }
+        } else if let Some(free) = self.candidates.iter_mut().find(|s| s.is_none()) {
+            *free = Some(c);
+        }
     }
 
     /// Those of the places that are near to the place `k`, or to one that is; of those that stand alone none.

@@ -328,6 +328,85 @@ fn the_bead_nearest_to_the_aim_is_chosen() {
 }
 
 #[test]
+fn what_was_rejected_is_chosen_nowhere_again_while_it_stands_and_the_glass_may_drift() {
+    let mut random = Random(7);
+    let mut scene = Scene::new();
+    let mut tracker = tracker();
+    let (mut x, mut y) = (60.0, 30.0);
+    let mut decisions = vec![];
+    for n in 0..1600 {
+        // Two beads on the glass, which drifts by 2 px in a second, are stronger than the one that swims.
+        let glass = 2e-3 * f64::from(n);
+        let mut beads = vec![(20.0 + glass, 20.0, 1.2), (24.0 + glass, 46.0, 1.1)];
+        let gone = (100..1200).contains(&n);
+        if !gone {
+            beads.push((x, y, 1.0));
+        }
+        let frame = scene.draw(&beads, &mut random);
+        let t = tracker.step(Some(&frame), f64::from(n) * DT_S, (0.0, 0.0));
+        let near = |x: f64, y: f64| f64::hypot(t.x_px - x, t.y_px - y) < 2.0;
+        match n {
+            19 => assert!(near(20.0 + glass, 20.0), "{t:?}"),
+            39 => assert!(near(24.0 + glass, 46.0), "{t:?}"),
+            60..100 => assert!(near(x, y) && t.state == TrackState::Tracking, "{n} {t:?}"),
+            160..1200 => assert!(t.state != TrackState::Tracking, "{n} {t:?}"),
+            1250.. => assert!(near(x, y) && t.state == TrackState::Tracking, "{n} {t:?}"),
+            _ => {}
+        }
+        decisions.push(t.decision);
+        if n == 19 || n == 39 {
+            tracker.reject();
+        }
+        x += step(&mut random);
+        y += step(&mut random);
+        if n == 700 {
+            // The operator looks for a bead while there is none: what stands is no choice, and the step says so.
+            tracker.choose(None);
+        }
+    }
+    assert_eq!(decisions.get(900), Some(&Decision::Stays));
+}
+
+#[test]
+fn a_bead_among_beads_on_the_glass_is_followed_through_pulses_and_steps_of_the_flow() {
+    let (mut refused, mut frames) = (0, 0);
+    for seed in 1..=20 {
+        let mut random = Random(seed * 7919);
+        let mut scene = Scene::new();
+        let mut tracker = tracker();
+        tracker.choose(Some((48.0, 32.0)));
+        let (mut x, mut y) = (48.0, 32.0);
+        for n in 0..600 {
+            // The pulse of arming, then an uncommanded step of the flow, for 5 frames, there and back.
+            let there_and_back = |from: i32, px: f64| match n - from {
+                0..5 => px,
+                5..10 => -px,
+                _ => 0.0,
+            };
+            let commanded = there_and_back(60, 2.0);
+            let flow = commanded + there_and_back(200 + 20 * (seed % 10) as i32, 3.0);
+            x += flow + step(&mut random);
+            y += 0.3 * step(&mut random);
+            x += 0.02 * (48.0 - x);
+            y += 0.05 * (32.0 - y);
+            let beads = [(20.0, 14.0, 1.1), (75.0, 50.0, 1.3), (x, y, 1.0)];
+            let frame = scene.draw(&beads, &mut random);
+            let px_per_s = (commanded / DT_S, 0.0);
+            let t = tracker.step(Some(&frame), f64::from(n) * DT_S, px_per_s);
+            if n > 20 {
+                frames += 1;
+                refused += u32::from(!t.decision.is_accepted());
+                let off_px = f64::hypot(t.fix.x_px - x, t.fix.y_px - y);
+                assert!(!t.decision.is_accepted() || off_px < 1.0, "{n} {t:?}");
+            }
+        }
+        assert_eq!(tracker.state(), TrackState::Tracking, "seed {seed}");
+    }
+    println!("{refused} of {frames} frames refused");
+    assert!(refused * 200 < frames, "{refused} of {frames}");
+}
+
+#[test]
 fn a_fix_waits_for_no_look_at_what_else_is_there_and_the_look_finds_it() {
     let (mut random, mut scene) = (Random(11), Scene::new());
     let (mut at_once, mut whole) = (tracker(), tracker());
