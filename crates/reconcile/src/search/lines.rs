@@ -84,21 +84,22 @@ pub(crate) fn line_scan(
     }
     // Fine enough for the highest multiple.
     let step_hz = 1.0 / (bins as f64 * ctx.problem.base.sample_s * harmonics as f64);
+    let (from, to) = ((hz.lower / step_hz) as usize, (hz.upper / step_hz) as usize);
+    let least = threshold_of_waves(to - from);
     let gain = |m: usize| -> f64 {
         let at = |times: usize| power.get((times * m + harmonics / 2) / harmonics);
-        (1..=harmonics).filter_map(at).sum()
+        // A line's halves and thirds have it among their multiples: what is there itself has to stand out as well.
+        let itself = at(1).is_some_and(|power| *power > least);
+        if itself {
+            (1..=harmonics).filter_map(at).sum()
+        } else {
+            0.0
+        }
     };
-    let (from, to) = ((hz.lower / step_hz) as usize, (hz.upper / step_hz) as usize);
-    let gains: Vec<f64> = (from..=to).map(gain).collect();
-    let most = gains.iter().copied().fold(0.0, f64::max);
-    // A line's halves and thirds have it among their multiples.
-    let best = gains.iter().rposition(|gain| *gain >= SAME * most)?;
-    let best = (from + best) as f64 * step_hz;
-    Some(Part::new(variant, &[best]))
+    let gains = (from..=to).map(|m| (m, gain(m)));
+    let (best, most) = gains.max_by(|a, b| a.1.total_cmp(&b.1))?;
+    (most > 0.0).then(|| Part::new(variant, &[best as f64 * step_hz]))
 }
-
-/// Share of the most gain at which two frequencies gain the same.
-const SAME: f64 = 0.98;
 
 /// The frequency of the strongest line in the innovations that is on no line of the command, if any stands out.
 pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {

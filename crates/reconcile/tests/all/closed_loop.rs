@@ -64,6 +64,8 @@ pub(super) enum Hidden {
     GainDrift(f64),
     /// Frequency \[Hz\] and size \[um\] of a line in the picture.
     Line(f64, f64),
+    /// Strokes that move the zero flow: Hz, and the size of the first of four multiples \[um\], the others less by their number.
+    Pump(f64, f64),
 }
 
 impl Hidden {
@@ -98,14 +100,8 @@ impl Hidden {
                 vec![("frequency_hz", hz), ("damping", d), ("share", share)],
             ),
             Self::GainDrift(r) => ("gain-drift", vec![("per_s", r)]),
-            Self::Line(hz, um) => (
-                if hz < 40.0 {
-                    "pump-pulsation"
-                } else {
-                    "mains-hum"
-                },
-                vec![("hz", hz), ("um", um)],
-            ),
+            Self::Line(hz, um) => ("mains-hum", vec![("hz", hz), ("um", um)]),
+            Self::Pump(hz, _) => ("pump-pulsation", vec![("hz", hz), ("second", 0.25)]),
         }
     }
 }
@@ -136,7 +132,8 @@ impl Chain {
             | Hidden::Adhesion(_)
             | Hidden::Drops(_)
             | Hidden::Repeats(_)
-            | Hidden::Line(..) => u,
+            | Hidden::Line(..)
+            | Hidden::Pump(..) => u,
             Hidden::Gain(factor) => factor * u,
             Hidden::GainDrift(per_s) => {
                 s[0] += h;
@@ -301,7 +298,15 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
     let (mut t, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
     for k in 0..ROWS {
         let now_s = k as f64 * ROW_S;
-        let zero = wander + flow.drift_um_per_s * now_s;
+        let strokes_um = |hz: f64, um: f64| -> f64 {
+            let one = |k: f64| um / k * (TAU * k * hz * now_s + k * k).sin();
+            [1.0, 2.0, 3.0, 4.0].map(one).iter().sum()
+        };
+        let pumped_um = match hidden {
+            Hidden::Pump(hz, um) => strokes_um(hz, um),
+            _ => 0.0,
+        };
+        let zero = wander + flow.drift_um_per_s * now_s + pumped_um;
         let mut position = 0.0;
         for i in 0..STEPS_A_ROW {
             let input = chain.advance(commands[k * STEPS_A_ROW + i], step_s) - zero;

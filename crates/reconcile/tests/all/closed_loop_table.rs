@@ -8,7 +8,7 @@ use crate::closed_loop::{DELAY_S, Flow, Hidden, closed_loop, run_from, survey};
 use cellpos_numeric::Random;
 use cellpos_reconcile::{Options, Reconciliation, Record};
 
-const ROWS: [Hidden; 22] = [
+const ROWS: [Hidden; 24] = [
     Hidden::Nothing,
     Hidden::Leak(2.0),
     Hidden::Clip(19.4, 20.6),
@@ -31,6 +31,8 @@ const ROWS: [Hidden; 22] = [
     Hidden::Shake(30.0, 0.1, 0.3),
     Hidden::GainDrift(-0.004),
     Hidden::Line(50.0, 0.1),
+    Hidden::Pump(3.3, 0.1),
+    Hidden::Pump(0.8, 0.02),
 ];
 
 fn flow_of(seed: u64) -> Flow {
@@ -90,6 +92,13 @@ fn a_bead_that_sticks_does_so_in_the_flow_and_nothing_is_named_beside_it() {
 fn a_bead_that_sticks_does_so_in_the_flow_among_all_that_a_command_looks_for() {
     let adhesion = Hidden::Adhesion(40.0);
     assert!(row(adhesion, &look(adhesion, 102)));
+}
+
+#[test]
+fn a_pump_is_told_by_its_strokes_which_the_command_answers() {
+    // The law holds against the strokes: the command has the same lines as they have.
+    let pump = Hidden::Pump(3.3, 0.1);
+    assert!(row(pump, &look_for(pump, 3, 2)));
 }
 
 #[test]
