@@ -46,6 +46,13 @@ impl Followed {
         }
     }
 
+    fn search_anew(&mut self) {
+        match self {
+            Self::Bead(tracker) => tracker.search_anew(),
+            Self::Cell(tracker) => tracker.search_anew(),
+        }
+    }
+
     fn reject(&mut self) {
         match self {
             Self::Bead(tracker) => tracker.reject(),
@@ -373,6 +380,12 @@ impl<C: Camera> PositionSource for VisionSource<C> {
 
     fn truth_um(&mut self) -> f64 {
         self.camera.truth_um()
+    }
+
+    fn begin(&mut self) {
+        if self.followed.state() == TrackState::Lost {
+            self.followed.search_anew();
+        }
     }
 
     fn rejections(&self) -> Option<Rejections> {

@@ -216,6 +216,9 @@ pub trait PositionSource: Send {
     /// Description of the source.
     fn info(&self) -> SourceInfo;
 
+    /// A run begins. Whoever has lost what it followed looks for another: nothing is held yet.
+    fn begin(&mut self) {}
+
     /// Where to reject what it follows; `None` if the source can follow nothing else.
     fn rejections(&self) -> Option<Rejections> {
         None

@@ -81,6 +81,7 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
     threads: &Threads,
     operator: &Arc<Operator>,
 ) -> Result<Finished<S>, RunError> {
+    source.begin();
     let (ticker, ends) = Ticker::new(
         core,
         source.rejections(),

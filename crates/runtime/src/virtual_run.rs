@@ -38,6 +38,7 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
     let periods_ns = [core.timing().period_ns(), core.frame_period_ns()];
     let start_ns = clock.now_ns();
     let mut pacer = Pacer::new(periods_ns, start_ns);
+    source.begin();
     let (sizes, rejections) = (RingSizes::default(), source.rejections());
     let (mut ticker, ends) = Ticker::new(core, rejections, clock.clone(), start_ns, sizes);
     let Ends {

@@ -179,6 +179,33 @@ fn a_bead_of_another_brightness_in_the_same_place_gives_no_position() {
 }
 
 #[test]
+fn a_run_that_begins_after_the_bead_was_lost_takes_the_one_that_is_there() {
+    let template = template();
+    let mut camera = Scripted::new();
+    for n in 0..200 {
+        let brightness = if n < 20 { 1.0 } else { 0.5 };
+        camera.frame(
+            &template,
+            n as u64,
+            n * PERIOD_NS,
+            &[(60.0, 32.0, brightness)],
+        );
+    }
+    let mut source = source(camera, straight());
+    source.begin();
+    let seen: Vec<_> = (0..150).filter_map(|_| source.next(0).ok()?).collect();
+    // A run that goes on keeps to its bead.
+    assert!(seen[19].is_usable() && seen[20..].iter().all(|m| !m.is_usable()));
+    assert_eq!(seen[149].track.unwrap().0, TrackState::Lost);
+    source.begin();
+    let seen: Vec<_> = (0..20).filter_map(|_| source.next(0).ok()?).collect();
+    assert!(seen[10..].iter().all(Measurement::is_usable));
+    // A bead that is followed when a run begins is followed on.
+    source.begin();
+    assert!(source.next(0).ok().flatten().unwrap().is_usable());
+}
+
+#[test]
 fn frames_that_come_twice_late_or_with_an_old_stamp_are_not_looked_at() {
     let template = template();
     let here = &[(60.0, 32.0, 1.0)];

@@ -91,6 +91,11 @@ impl CellTracker {
     /// Forgets the cell and searches for the one nearest to `aim` (px), or for the most prominent without an aim.
     pub fn choose(&mut self, aim: Option<(f64, f64)>) {
         self.aim = aim;
+        self.search_anew();
+    }
+
+    /// Forgets the cell and searches as at the start.
+    pub fn search_anew(&mut self) {
         self.chosen = None;
         self.standing.state = TrackState::Searching;
     }
@@ -99,7 +104,7 @@ impl CellTracker {
     pub fn reject(&mut self) {
         if let Some(chosen) = self.chosen {
             self.stays.add(&chosen.cell);
-            self.choose(self.aim);
+            self.search_anew();
         }
     }
 

@@ -123,6 +123,11 @@ impl Tracker {
     /// the operator's way to settle what the tracker calls ambiguous.
     pub fn choose(&mut self, aim: Option<(f64, f64)>) {
         self.aim = aim;
+        self.search_anew();
+    }
+
+    /// Forgets the bead and searches as at the start.
+    pub fn search_anew(&mut self) {
         self.chosen = None;
         self.neighbours = Neighbours::default();
         self.beside = Beside::default();
@@ -134,7 +139,7 @@ impl Tracker {
     pub fn reject(&mut self) {
         if let Some(chosen) = self.chosen {
             self.rejected.add(chosen.motion.position());
-            self.choose(self.aim);
+            self.search_anew();
         }
     }
 
