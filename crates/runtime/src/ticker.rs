@@ -121,7 +121,8 @@ pub struct Ticker<R> {
 }
 
 impl<R: ReferenceGenerator> Ticker<R> {
-    /// Puts rings around a core. `rejections` is where the source of its positions hears that it follows no bead, `start_ns` the start of the run on `clock`.
+    /// Puts rings around a core. `rejections` is where the source of its positions hears that it follows no bead, `start_ns` the start
+    /// of the run on `clock`.
     pub fn new(
         core: Core<R>,
         rejections: Option<Rejections>,

@@ -161,6 +161,17 @@ pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
 }
 
 impl Context<'_> {
+    /// Mean amplitude of a line at `times` its frequency, over the rows of the records \[um\].
+    pub(crate) fn mean_wave_um(&self, line: &[Vec<[f64; 2]>], times: usize) -> f64 {
+        let records = &self.problem.records;
+        let rows: f64 = records.iter().map(|r| r.u.len() as f64).sum();
+        let of = |(r, waves): (&Prepared, &Vec<[f64; 2]>)| {
+            let [a, b] = waves.get(times - 1).copied().unwrap_or_default();
+            a.hypot(b) * r.u.len() as f64
+        };
+        records.iter().zip(line).map(of).sum::<f64>() / rows
+    }
+
     /// Whether the plant integrates slowly enough for a nanometre of displacement to become a ramp.
     pub(crate) fn integrates(&self) -> bool {
         let poles = &self.problem.base.zpk.poles;

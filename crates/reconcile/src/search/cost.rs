@@ -29,6 +29,11 @@ pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }
 
+/// Price of the amplitudes of a part's waves, which are free numbers beside its own.
+pub(crate) fn price_of_waves(part: &Part, records: usize) -> f64 {
+    NUMBER * (freedom_of(part.variant(), records) - part.variant().params.len()) as f64
+}
+
 /// Sum of squares with a price per parameter, so that a form with many numbers wins only if it is worth them.
 pub(crate) fn penalised_cost(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let left = surely_left(ctx, fit);

@@ -3,7 +3,6 @@
 use crate::data::floor::Floor;
 use crate::data::frames::FrameCounts;
 use crate::fit::context::{Context, Fit};
-use crate::problem::Prepared;
 use crate::simulate::near_whole;
 use crate::units::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
@@ -46,24 +45,14 @@ fn effect_of(ctx: &Context<'_>, fit: &Fit, index: usize) -> Option<Effect> {
         Role::Line { harmonics } => {
             let line = &fit.lines[fit.nth_of_role(index)];
             let [a, b] = line.first()?.first().copied()?;
-            let records = &ctx.problem.records;
-            let rows: f64 = records.iter().map(|r| r.u.len() as f64).sum();
-            let mean_um = |harmonic: usize| -> f64 {
-                let of = |(r, waves): (&Prepared, &Vec<[f64; 2]>)| {
-                    let [a, b] = waves.get(harmonic).copied().unwrap_or_default();
-                    a.hypot(b) * r.u.len() as f64
-                };
-                records.iter().zip(line).map(of).sum::<f64>() / rows
-            };
-            let um = mean_um(0);
+            let um = ctx.mean_wave_um(line, 1);
             // Amplitude and phase are no parameters of the fit: the form of the effect has them in addition to the frequency.
             let effect = part.effect(&ctx.scope).with_parameter("um", um);
             let effect =
                 effect.and_then(|e| e.with_parameter("phase_deg", b.atan2(a).to_degrees()));
             if harmonics > 1 && um > 0.0 {
-                return effect
-                    .and_then(|e| e.with_parameter("second", mean_um(1) / um))
-                    .ok();
+                let second = ctx.mean_wave_um(line, 2) / um;
+                return effect.and_then(|e| e.with_parameter("second", second)).ok();
             }
             effect.ok()
         }

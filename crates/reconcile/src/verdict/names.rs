@@ -3,7 +3,7 @@
 use crate::data::frames::{self, FrameCounts};
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::search::cost::{prior_penalty, surely_left};
+use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
 use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::form;
@@ -73,6 +73,8 @@ fn alternatives(
         } else {
             0.0
         };
+        let records = ctx.problem.records.len();
+        let price = price + price_of_waves(&r.part, records) - price_of_waves(part, records);
         let ties = r.chi2 + price - fit.chi2 < THRESHOLDS.tie && !decided;
         if ties && !(richer && ends_as_well(ctx, fit, index, r)) {
             open |= !inseparable(id, r.id);

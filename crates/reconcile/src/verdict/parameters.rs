@@ -73,7 +73,7 @@ pub(crate) fn parameters(
             let um = wave_um(ctx, part, line, 1);
             if harmonics > 1 && um.value > 0.0 {
                 let of_second = wave_um(ctx, part, line, 2);
-                let share = |um_: f64| um_ / um.value;
+                let share = |second_um: f64| second_um / um.value;
                 let second = Interval {
                     value: share(of_second.value),
                     ci95: of_second.ci95.map(share),
@@ -129,13 +129,7 @@ fn about(value: f64, sd: f64, unit: &str) -> Interval {
 fn wave_um(ctx: &Context<'_>, part: &Part, line: &[Vec<[f64; 2]>], times: usize) -> Interval {
     let records = &ctx.problem.records;
     let rows: f64 = records.iter().map(|r| r.u.len() as f64).sum();
-    let mean = records
-        .iter()
-        .zip(line)
-        .filter_map(|(r, waves)| waves.get(times - 1).map(|[a, b]| (r, a.hypot(*b))))
-        .map(|(r, um)| um * r.u.len() as f64)
-        .sum::<f64>()
-        / rows;
+    let mean = ctx.mean_wave_um(line, times);
     // One record's amplitude has the error sigma sqrt(2/n) over the filter's gain at the line.
     let w = std::f64::consts::TAU * times as f64 * part.natural()[0] * ctx.problem.base.sample_s;
     let theta = ctx.problem.noise.white_um2 / ctx.problem.noise.innovation_um().powi(2);
