@@ -108,6 +108,18 @@ fn all(source: &mut VisionSource<Scripted>) -> Vec<Measurement> {
     std::iter::from_fn(|| source.next(0).ok().flatten()).collect()
 }
 
+/// A bead in whose place one of another brightness is from frame 20 on.
+fn half_as_bright_from_frame_20(frames: i64) -> Scripted {
+    let template = template();
+    let mut camera = Scripted::new();
+    for n in 0..frames {
+        let brightness = if n < 20 { 1.0 } else { 0.5 };
+        let bead = (60.0, 32.0, brightness);
+        camera.frame(&template, n as u64, n * PERIOD_NS, &[bead]);
+    }
+    camera
+}
+
 fn straight() -> Calibration {
     Calibration::along_rows(0.1, 0.0, 1.0)
 }
@@ -159,17 +171,7 @@ fn what_no_flow_can_have_carried_there_is_not_the_bead() {
 
 #[test]
 fn a_bead_of_another_brightness_in_the_same_place_gives_no_position() {
-    let template = template();
-    let mut camera = Scripted::new();
-    for n in 0..40 {
-        let brightness = if n < 20 { 1.0 } else { 0.5 };
-        camera.frame(
-            &template,
-            n as u64,
-            n * PERIOD_NS,
-            &[(60.0, 32.0, brightness)],
-        );
-    }
+    let camera = half_as_bright_from_frame_20(40);
     let seen = all(&mut source(camera, straight()));
     assert!(seen[5..20].iter().all(Measurement::is_usable));
     for m in &seen[20..] {
@@ -180,17 +182,7 @@ fn a_bead_of_another_brightness_in_the_same_place_gives_no_position() {
 
 #[test]
 fn a_run_that_begins_after_the_bead_was_lost_takes_the_one_that_is_there() {
-    let template = template();
-    let mut camera = Scripted::new();
-    for n in 0..200 {
-        let brightness = if n < 20 { 1.0 } else { 0.5 };
-        camera.frame(
-            &template,
-            n as u64,
-            n * PERIOD_NS,
-            &[(60.0, 32.0, brightness)],
-        );
-    }
+    let camera = half_as_bright_from_frame_20(200);
     let mut source = source(camera, straight());
     source.begin();
     let seen: Vec<_> = (0..150).filter_map(|_| source.next(0).ok()?).collect();
