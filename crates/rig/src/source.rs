@@ -184,17 +184,17 @@ pub trait FrameWatch: Send {
     fn frame(&mut self, seen: &SeenFrame<'_>);
 }
 
-/// The loop's word to a source that what it follows did not move with the PZT, so that it looks for another.
+/// Tells a source that the object it follows did not move with the PZT: it looks for another one.
 #[derive(Debug, Clone, Default)]
 pub struct Rejections(Arc<AtomicU32>);
 
 impl Rejections {
-    /// Rejects what is followed now. Neither locks nor waits.
+    /// Rejects the object that is followed now. Neither locks nor waits.
     pub fn reject(&self) {
         self.0.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How often something was rejected.
+    /// How many objects were rejected.
     pub fn count(&self) -> u32 {
         self.0.load(Ordering::Relaxed)
     }
@@ -216,10 +216,10 @@ pub trait PositionSource: Send {
     /// Description of the source.
     fn info(&self) -> SourceInfo;
 
-    /// A run begins. Whoever has lost what it followed looks for another: nothing is held yet.
+    /// A run begins, and nothing is held yet: a source that has lost its bead looks for another one.
     fn begin(&mut self) {}
 
-    /// Where to reject what it follows; `None` if the source can follow nothing else.
+    /// Where to reject the object that it follows. `None` if the source can follow no other.
     fn rejections(&self) -> Option<Rejections> {
         None
     }

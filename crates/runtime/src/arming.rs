@@ -10,8 +10,8 @@
 //! that came late or not at all, answer another pulse: they are left out. While the fit cannot decide, or refuses the plant after such a
 //! command, the pulse is made again. All pulses are fitted together, until the patience of arming ends.
 //!
-//! What does not move at all may be a bead on the glass, and another one the bead: it is left for another, which the pulse tries anew.
-//! If no other comes, or none of several moves, the plant is refused.
+//! An object that does not move at all may be a bead on the glass. It is rejected, and the pulse tries another object. If no other comes,
+//! or none of several moves, the plant is refused.
 
 use crate::life::Refusal;
 use cellpos_control::LoopModel;
@@ -118,7 +118,7 @@ pub struct ArmingState {
     unseen: u32,
     /// Ticks of the pulses before this one.
     spent: u32,
-    /// What the last one that did not move has shown, and how many there were.
+    /// The check of the last object that did not move, and how many there were.
     unmoved: Option<GainCheck>,
     rejected: u32,
     /// Tick of the pulse; `None` before it.
@@ -171,7 +171,7 @@ impl ArmingState {
 
 /// Ticks in a row without a frame that a steady bead may have where each tick has one.
 const MOST_SILENT: u32 = 3;
-/// Objects that are tried: as many as the tracker remembers. One that only gives positions is tried as often.
+/// Objects that are rejected: as many as the tracker remembers. A source that gives positions alone is tried as often.
 const MOST_REJECTED: u32 = 8;
 /// Ticks without a position after which the PZT goes to where the bead is believed to rest.
 const UNSEEN_TICKS: u32 = 50;
@@ -213,7 +213,7 @@ pub enum Step {
     Command(f64),
     /// The pulse leaves a doubt; hold this displacement, um, until the bead is steady again.
     Again(f64, GainCheck),
-    /// What is seen does not move; hold this displacement, um, until another one is steady.
+    /// The object in view does not move. Hold this displacement, um, until another one is steady.
     Another(f64, GainCheck),
     /// The check is over.
     Done(GainCheck),
@@ -345,8 +345,8 @@ impl Arming {
                 let doubtful = !verdict.sure || state.unled_at.is_some();
                 let spent = state.spent.saturating_add(tick);
                 let unmoved = verdict.refusal == Some(Refusal::NoResponse) && !doubtful;
+                let base_um = state.base_um;
                 if unmoved && state.rejected < MOST_REJECTED {
-                    let base_um = state.base_um;
                     *state = ArmingState {
                         unmoved: Some(verdict),
                         rejected: state.rejected + 1,
@@ -357,7 +357,6 @@ impl Arming {
                 if verdict.refusal.is_none() || !doubtful || spent > self.config.patience_ticks {
                     return Step::Done(verdict);
                 }
-                let base_um = state.base_um;
                 *state = ArmingState {
                     spent,
                     seen: state.seen,

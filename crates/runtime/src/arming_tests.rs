@@ -243,7 +243,7 @@ fn late_ticks(cost: f64) -> Vec<Option<u32>> {
 
 #[test]
 fn what_does_not_move_is_left_for_another_that_does_and_refused_if_none_comes() {
-    // One on the glass while the first pulse goes on; then none is seen; then the bead is.
+    // The first pulse sees an object on the glass. Then none is seen for a while, and at last the bead.
     for comes in [Some(450), None] {
         let mut last = 0;
         let seen = |tick: u32, um: f64| {

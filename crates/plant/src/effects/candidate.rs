@@ -80,8 +80,7 @@ pub struct Scope {
 pub enum Role {
     /// In the chain, its numbers common to all records.
     Chain,
-    /// A line, and its multiples up to a number of them in all, each with amplitude and phase per record; the first parameter is its
-    /// frequency, Hz.
+    /// A line and its multiples, each with amplitude and phase per record. The first parameter is the frequency of the line, Hz.
     Line {
         /// How many, the line itself among them.
         harmonics: usize,

@@ -49,7 +49,7 @@ impl EffectKind for PumpPulsation {
         }))
     }
 
-    /// The harmonics of a stroke fall off at least as their number: five hold 96 % of a saw-tooth's speed beyond its mean.
+    /// The harmonics of a stroke fall off at least as their number: five hold 89 % of the power of a saw-tooth.
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &[Candidate {
             off_response: true,

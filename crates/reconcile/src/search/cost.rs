@@ -29,7 +29,7 @@ pub(crate) fn threshold_of(v: &Candidate, records: usize) -> f64 {
     threshold(freedom_of(v, records))
 }
 
-/// Price of the amplitudes of a part's waves, which are free numbers beside its own.
+/// Price of the amplitudes of a part's waves, which are free numbers as its parameters are.
 pub(crate) fn price_of_waves(part: &Part, records: usize) -> f64 {
     NUMBER * (freedom_of(part.variant(), records) - part.variant().params.len()) as f64
 }

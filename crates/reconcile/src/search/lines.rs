@@ -7,7 +7,7 @@ use crate::problem::Mask;
 use crate::search::cost::threshold_of_waves;
 use crate::search::suspect::line_score;
 use crate::thresholds::THRESHOLDS;
-use cellpos_plant::effects::Role;
+use cellpos_plant::effects::{FitParameter, Role};
 use realfft::RealFftPlanner;
 use realfft::num_complex::Complex;
 use std::f64::consts::TAU;
@@ -54,79 +54,123 @@ pub(crate) fn without_line(ctx: &Context<'_>, fit: &Fit, hz: f64, train: &Mask) 
     })
 }
 
-/// Where a fit of a line, or of one with its multiples, begins: at the most power in the spectrum of the innovations. `None` for a
-/// candidate of another kind.
+/// Where fits of lines, alone or with their multiples, begin: each at the most power in the spectrum of the innovations. Candidates of
+/// another kind have no start here.
 ///
 /// The filter is the same for neighbouring frequencies, so that it divides out of the gain of a line.
-pub(crate) fn line_scan(
+pub(crate) fn line_starts(
     ctx: &Context<'_>,
     fit: &Fit,
-    variant: Variant,
+    variants: &[Variant],
     mask: &Mask,
-) -> Option<Part> {
-    let candidate = variant.candidate();
-    let (Role::Line { harmonics }, [hz]) = (candidate.role, candidate.params) else {
-        return None;
+) -> Vec<Part> {
+    let of_line = |v: &Variant| match (v.candidate().role, v.candidate().params) {
+        (Role::Line { harmonics }, [hz]) => Some((*v, harmonics, hz)),
+        _ => None,
     };
-    let rows = fit.innovations.iter().map(Vec::len).max()?;
-    let bins = (4 * rows).next_power_of_two();
-    let plan = RealFftPlanner::<f64>::new().plan_fft_forward(bins);
-    let (mut counted, mut transform) = (plan.make_input_vec(), plan.make_output_vec());
-    let mut spectrum = |e: &[f64], ranges: &[Range<usize>], part: Range<usize>| {
-        counted.fill(0.0);
-        let mut count = 0;
-        for range in ranges {
-            let range = range.start.max(part.start)..range.end.min(part.end);
-            count += range.len();
-            if !range.is_empty() {
-                counted[range.clone()].copy_from_slice(&e[range]);
-            }
-        }
-        plan.process(&mut counted, &mut transform).ok()?;
-        let power = |x: &Complex<f64>| 2.0 * x.norm_sqr() / count.max(1) as f64;
-        Some((count, transform.iter().map(power).collect::<Vec<f64>>()))
-    };
-    let (mut whole, mut parts) = (vec![0.0; bins / 2 + 1], Vec::new());
-    let mut count = 0;
-    for (e, ranges) in fit.innovations.iter().zip(mask) {
-        let (own, power) = spectrum(e, ranges, 0..e.len())?;
-        count += own;
-        whole.iter_mut().zip(power).for_each(|(sum, x)| *sum += x);
-        for k in 0..STROKES_IN {
-            let part = k * e.len() / STROKES_IN..(k + 1) * e.len() / STROKES_IN;
-            parts.push(spectrum(e, ranges, part)?);
-        }
+    let lines: Vec<_> = variants.iter().filter_map(of_line).collect();
+    let highest_hz = (lines.iter())
+        .map(|(_, harmonics, hz)| *harmonics as f64 * hz.upper)
+        .fold(0.0, f64::max);
+    if lines.is_empty() {
+        return Vec::new();
     }
-    // Fine enough for the highest multiple.
-    let step_hz = 1.0 / (bins as f64 * ctx.problem.base.sample_s * harmonics as f64);
-    let (from, to) = ((hz.lower / step_hz) as usize, (hz.upper / step_hz) as usize);
-    let least = threshold_of_waves(to - from);
-    let bin = |m: usize, times: usize| (times * m + harmonics / 2) / harmonics;
-    let gain = |m: usize| -> f64 {
-        // A line's halves and thirds have it among their multiples: what is there itself has to stand out as well.
-        let itself = whole.get(bin(m, 1)).copied().unwrap_or(0.0);
-        let goes_on = || {
-            parts.iter().all(|(rows, power)| {
-                let expected = itself * *rows as f64 / count as f64;
-                expected < least || power[bin(m, 1)] > STOPPED * expected
-            })
-        };
-        if itself < least || !goes_on() {
-            return 0.0;
-        }
-        let powers = (1..=harmonics).filter_map(|times| whole.get(bin(m, times)));
-        powers.sum()
+    let Some(spectra) = Spectra::of(ctx, fit, mask, highest_hz) else {
+        return Vec::new();
     };
-    let gains = (from..=to).map(|m| (m, gain(m)));
-    let (best, most) = gains.max_by(|a, b| a.1.total_cmp(&b.1))?;
-    (most > 0.0).then(|| Part::new(variant, &[best as f64 * step_hz]))
+    let start = |(variant, harmonics, hz): (Variant, usize, &FitParameter)| {
+        let hz = spectra.strongest(harmonics, hz.lower..hz.upper)?;
+        Some(Part::new(variant, &[hz]))
+    };
+    lines.into_iter().filter_map(start).collect()
 }
 
-/// Parts of each record in which a line has to be: what comes with the command is where the command has its line, and a pump or the mains
-/// do not stop with it.
-const STROKES_IN: usize = 4;
-/// Share of its mean power below which a line is not in a part. Where so much is expected as stands out of noise (20 and more), noise
-/// takes no line below it once in a thousand times.
+/// Power of the innovations by frequency: the gain of a line of that frequency.
+struct Spectra {
+    /// From one frequency to the next, Hz.
+    step_hz: f64,
+    /// Of all records.
+    whole: Vec<f64>,
+    /// Of the parts of each record, with their share of the rows.
+    parts: Vec<(f64, Vec<f64>)>,
+}
+
+impl Spectra {
+    fn of(ctx: &Context<'_>, fit: &Fit, mask: &Mask, highest_hz: f64) -> Option<Self> {
+        let rows = fit.innovations.iter().map(Vec::len).max()?;
+        let bins = (4 * rows).next_power_of_two();
+        let step_hz = 1.0 / (bins as f64 * ctx.problem.base.sample_s);
+        let kept = (bins / 2 + 1).min((highest_hz / step_hz) as usize + 2);
+        let plan = RealFftPlanner::<f64>::new().plan_fft_forward(bins);
+        let (mut counted, mut transform) = (plan.make_input_vec(), plan.make_output_vec());
+        let mut spectrum = |e: &[f64], ranges: &[Range<usize>], part: Range<usize>| {
+            counted.fill(0.0);
+            let mut count = 0;
+            for range in ranges {
+                let range = range.start.max(part.start)..range.end.min(part.end);
+                count += range.len();
+                if !range.is_empty() {
+                    counted[range.clone()].copy_from_slice(&e[range]);
+                }
+            }
+            plan.process(&mut counted, &mut transform).ok()?;
+            let power = |x: &Complex<f64>| 2.0 * x.norm_sqr() / count.max(1) as f64;
+            let powers: Vec<f64> = transform[..kept].iter().map(power).collect();
+            Some((count as f64, powers))
+        };
+        let (mut whole, mut parts, mut count) = (vec![0.0; kept], Vec::new(), 0.0);
+        for (e, ranges) in fit.innovations.iter().zip(mask) {
+            let (own, power) = spectrum(e, ranges, 0..e.len())?;
+            count += own;
+            whole.iter_mut().zip(power).for_each(|(sum, x)| *sum += x);
+            for k in 0..PARTS_OF_RECORD {
+                let part = k * e.len() / PARTS_OF_RECORD..(k + 1) * e.len() / PARTS_OF_RECORD;
+                parts.push(spectrum(e, ranges, part)?);
+            }
+        }
+        for (rows, _) in &mut parts {
+            *rows /= count;
+        }
+        Some(Self {
+            step_hz,
+            whole,
+            parts,
+        })
+    }
+
+    /// The frequency, Hz, that gains most together with its multiples, `harmonics` in all. It has to stand out itself, because the halves
+    /// and thirds of a line have the line among their multiples; and in every part in which so much is expected.
+    fn strongest(&self, harmonics: usize, hz: Range<f64>) -> Option<f64> {
+        // Fine enough for the highest multiple.
+        let step_hz = self.step_hz / harmonics as f64;
+        let (from, to) = ((hz.start / step_hz) as usize, (hz.end / step_hz) as usize);
+        let least = threshold_of_waves(to - from);
+        let bin = |m: usize, times: usize| (times * m + harmonics / 2) / harmonics;
+        let gain = |m: usize| -> f64 {
+            let itself = self.whole.get(bin(m, 1)).copied().unwrap_or(0.0);
+            let lasts = || {
+                self.parts.iter().all(|(share, power)| {
+                    let expected = itself * share;
+                    expected < least || power[bin(m, 1)] > STOPPED * expected
+                })
+            };
+            if itself < least || !lasts() {
+                return 0.0;
+            }
+            let powers = (1..=harmonics).filter_map(|times| self.whole.get(bin(m, times)));
+            powers.sum()
+        };
+        let gains = (from..=to).map(|m| (m, gain(m)));
+        let (best, most) = gains.max_by(|a, b| a.1.total_cmp(&b.1))?;
+        (most > 0.0).then_some(best as f64 * step_hz)
+    }
+}
+
+/// Parts of each record in which a line has to be. A misfit of the response is where the command moves. A pump or the mains do not stop
+/// with the command.
+const PARTS_OF_RECORD: usize = 4;
+/// Share of its mean power below which a line is not in a part. Where as much is expected as stands out of noise (some 30 times its
+/// variance), noise takes a line below that once in some five hundred times.
 const STOPPED: f64 = 0.25;
 
 /// The frequency of the strongest line in the innovations that is on no line of the command, if any stands out.

@@ -7,7 +7,7 @@ use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::Mask;
-use crate::search::lines::line_scan;
+use crate::search::lines::line_starts;
 use crate::search::pixel::pixel_scan;
 use crate::search::suspect::{Suspect, lines_score};
 use cellpos_plant::effects::Role;
@@ -21,13 +21,10 @@ pub(crate) fn screen(
     threads: usize,
     allowed: impl Fn(Variant) -> bool,
 ) -> Vec<Suspect> {
-    let mut jobs: Vec<Part> = Vec::new();
-    for v in &ctx.variants {
-        if allowed(*v) && v.candidate().role != Role::Position {
-            jobs.extend(v.starts(&ctx.scope));
-            jobs.extend(line_scan(ctx, fit, *v, mask));
-        }
-    }
+    let starting = |v: &Variant| allowed(*v) && v.candidate().role != Role::Position;
+    let starting: Vec<Variant> = ctx.variants.iter().copied().filter(starting).collect();
+    let mut jobs: Vec<Part> = (starting.iter().flat_map(|v| v.starts(&ctx.scope))).collect();
+    jobs.extend(line_starts(ctx, fit, &starting, mask));
     let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
     let scores = cellpos_numeric::parallel::map(&jobs, threads, |part| match part.variant().role {
         Role::Line { .. } => lines_score(ctx, fit, part, mask),

@@ -50,12 +50,12 @@ impl<C: Camera> Camera for Glass<C> {
 #[derive(Default)]
 struct Kept {
     events: Vec<EventKind>,
-    last_um: f64,
+    error_um: f64,
 }
 
 impl RunSink for Kept {
     fn tick(&mut self, record: &TickRecord) {
-        self.last_um = record.measured_um - record.true_um;
+        self.error_um = record.measured_um - record.true_um;
     }
     fn event(&mut self, event: &Event) {
         self.events.push(event.kind);
@@ -113,13 +113,12 @@ fn beads_on_the_glass_are_left_for_the_one_that_moves_with_the_pzt() {
         "{:?}",
         kept.events
     );
-    assert!(kept.last_um.abs() < 0.1, "{}", kept.last_um);
+    assert!(kept.error_um.abs() < 0.1, "{}", kept.error_um);
 }
 
 #[test]
 fn with_beads_on_the_glass_alone_arming_is_refused_for_want_of_an_answer() {
     let (ended, kept) = run(&[(60.0, 20.0), (190.0, 76.0)], true);
-
     let refused = kept.events.iter().find_map(|event| match event {
         EventKind::ArmingRefused { refusal, .. } => Some(*refusal),
         _ => None,

@@ -257,7 +257,7 @@ pub enum Decision {
     NoFrame = 12,
     /// The frame came twice, out of order or with an old time stamp, and was not looked at.
     Stale = 13,
-    /// The object stays in its place while cells pass: dirt, a wall.
+    /// The object stays in its place while cells pass, or while the PZT moves: dirt, a wall, a bead on the glass.
     Stays = 14,
     /// Another cell touches it, so that its size is not its own.
     InContact = 15,
