@@ -212,8 +212,9 @@ fn drive(
 fn follows(sheet: &mut Sheet, t: &mut Talk, range: &Range) -> Result<(), Failure> {
     t.pump()?;
     t.heard.clear();
+    let start_ns = t.now_ns();
     let seq = t.command(range.base_pm, range.base_pm)?;
-    let answer = t.wait(ANSWER_MS, |m| match m {
+    let answer = t.wait_since(start_ns, ANSWER_MS, |m| match m {
         ToHost::Status(status) if status.last_seq == Some(seq) => Some(*status),
         _ => None,
     })?;

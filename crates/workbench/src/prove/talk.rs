@@ -117,13 +117,14 @@ impl Talk {
         }
     }
 
-    /// Waits for the next message, at most for a time, ms; returns it with the time that it took, ms.
-    pub(super) fn wait<T>(
+    /// Waits for the answer to a message that was sent from `start_ns` on, at most for a time, ms; returns it with the time that it
+    /// took, ms. A board can answer before the write returns: the time begins before it.
+    pub(super) fn wait_since<T>(
         &mut self,
+        start_ns: i64,
         ms: f64,
         is: impl Fn(&ToHost) -> Option<T>,
     ) -> Result<Option<(T, f64)>, Failure> {
-        let start_ns = self.now_ns();
         let mut seen = 0;
         loop {
             self.pump()?;
@@ -149,8 +150,9 @@ impl Talk {
     ) -> Result<Option<(T, f64)>, Failure> {
         self.pump()?;
         self.heard.clear();
+        let start_ns = self.now_ns();
         self.send(message)?;
-        self.wait(ms, is)
+        self.wait_since(start_ns, ms, is)
     }
 
     /// Repeats the hello for as long as a board may take that is reset when its port is opened.

@@ -6,7 +6,7 @@ use cellpos_emulator::BoardConfig;
 use cellpos_link::{Decoder, MAX_FRAME, Message, ToBoard, ToHost, encode};
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// A change to messages: drop it, pass it on, or replace it.
 pub(crate) type Tamper<M> = fn(M) -> Option<M>;
@@ -88,6 +88,7 @@ pub(crate) struct DeskPort {
     to_board: Option<(Decoder<ToBoard>, Tamper<ToBoard>)>,
     to_host: Option<(Decoder<ToHost>, Tamper<ToHost>)>,
     ready: VecDeque<u8>,
+    write_takes: Duration,
 }
 
 impl DeskPort {
@@ -97,7 +98,14 @@ impl DeskPort {
             to_board: None,
             to_host: None,
             ready: VecDeque::new(),
+            write_takes: Duration::ZERO,
         }
+    }
+
+    /// A write returns so much later: the board has answered by then.
+    pub(crate) fn with_slow_writes(mut self, write_takes: Duration) -> Self {
+        self.write_takes = write_takes;
+        self
     }
 
     pub(crate) fn changing_orders(mut self, tamper: Tamper<ToBoard>) -> Self {
@@ -135,6 +143,7 @@ impl Port for DeskPort {
             None => bytes.to_vec(),
         };
         self.desk.lock().unwrap().receive(&passed);
+        std::thread::sleep(self.write_takes);
         Ok(bytes.len())
     }
 

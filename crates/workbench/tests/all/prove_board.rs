@@ -5,6 +5,7 @@ use cellpos_link::{Arm, Command, Refusal, Request, Status, ToBoard, ToHost};
 use cellpos_session::Failure;
 use cellpos_workbench::prove::board::{LINES, Trial, board};
 use cellpos_workbench::prove::{Sheet, Talk, Verdict};
+use std::time::Duration;
 
 /// Lines that a machine under load may fail for the board: its own lateness is in them.
 const OF_THE_MACHINE: [&str; 4] = [
@@ -199,6 +200,19 @@ fn each_broken_rule_fails_its_own_line() {
             failed(&sheet)
         );
     }
+}
+
+#[test]
+fn the_time_of_an_answer_begins_before_the_message_is_written() {
+    let port = DeskPort::new(&Desk::new()).with_slow_writes(Duration::from_millis(2));
+    let mut sheet = Sheet::default();
+    board(&mut sheet, Talk::on(Box::new(port)), &mut trial());
+    for name in ["round trip", "answers a command"] {
+        let ms = sheet.line("board", name).and_then(|line| line.value);
+        assert!(ms.is_some_and(|ms| ms >= 2.0), "{name}: {ms:?} ms");
+    }
+    let median = &sheet.line("board", "round trip").unwrap().note;
+    assert!(median.starts_with("median 2."), "{median}");
 }
 
 #[test]
