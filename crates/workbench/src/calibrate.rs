@@ -121,7 +121,7 @@ pub fn measure(
             Err(seen) => {
                 return Err(Failure::bad_input(
                     format!("a bead was seen in {seen} frames: too few, {TRIES} times in a row"),
-                    "look with cellpos camera --rig RIG --snapshot frame.png --overlay; see docs/rig.md, Light and focus",
+                    "look with cellpos camera --rig RIG --snapshot frame.png --overlay; if it marks no bead: cellpos camera --rig RIG --find-beads beads.png",
                 ));
             }
         }

@@ -1,6 +1,9 @@
 //! A first rig file: commented, with the devices that this machine offers.
 
+use cellpos_drivers::socket::SocketCamera;
+use cellpos_rig::Camera as _;
 use std::path::Path;
+use std::time::Duration;
 
 /// Devices for the new file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -68,6 +71,8 @@ pub struct Found {
     pub ports: Vec<String>,
     /// Cameras: sockets, addresses of industrial ones.
     pub cameras: Vec<String>,
+    /// Width of the camera's pictures, px, if it is known.
+    pub width_px: Option<usize>,
 }
 
 /// The devices found, as comments.
@@ -79,6 +84,17 @@ fn list(what: &str, found: &[String]) -> String {
         .map(|name| format!("#   {}\n", name.escape_debug()))
         .collect();
     format!("# {what} found on this machine:\n{lines}")
+}
+
+/// Column of position 0 um, the middle of the picture, with its comment.
+fn origin(width_px: Option<usize>) -> String {
+    let width = width_px.unwrap_or(256);
+    let comment = match width_px {
+        Some(_) => format!("column of position 0 um: the middle of {width} px"),
+        None => "column of position 0 um: write the middle of your picture, (width - 1) / 2; calibrate writes it, too".to_string(),
+    };
+    let number = format!("{:?}", 0.5 * (width as f64 - 1.0));
+    format!("origin_px = {number:<13}# {comment}\n")
 }
 
 /// The text of a rig file.
@@ -108,6 +124,7 @@ kind = \"emulated\"        # rendered frames; a real camera: --camera PATH_OF_A_
                      # region = {{ x_px = 0, y_px = 0, width_px = 256, height_px = 64 }}\n"
                 ),
             };
+            let origin = origin(found.width_px);
             format!(
                 "\
 [actuator]
@@ -120,8 +137,7 @@ hold_watchdog = \"2s\"     # holding time after which it parks
 {camera}
 [calibration]            # cellpos calibrate replaces it by calibration_file = \"calibration.toml\"
 pixel = \"0.1um\"          # a guess, until measured with a stage micrometer
-origin_px = 127.5        # column of position 0 um
-sign = 1.0               # +1: the coordinate rises when the PZT extends
+{origin}sign = 1.0               # +1: the coordinate rises when the PZT extends
 
 [vision]                 # beads of firmware-sim; for yours: cellpos camera --rig FILE --find-beads beads.png
 window_px = 21
@@ -164,17 +180,34 @@ pub fn camera(text: &str) -> Camera {
     }
 }
 
+/// Width of the pictures that a camera server sends, px; `None` if none comes soon.
+pub fn width_px(camera: &Camera) -> Option<usize> {
+    const PATIENCE: Duration = Duration::from_millis(500);
+    // Rate and delay are for its user.
+    let (rate_hz, delay_ms) = (1000.0, 2.0);
+    match camera {
+        Camera::Socket(path) => {
+            let camera = SocketCamera::connect(Path::new(path), rate_hz, delay_ms, PATIENCE);
+            camera.ok().map(|camera| camera.info().width_px)
+        }
+        Camera::Industrial(_) => None,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cellpos_link::frames::FrameHeader;
     use cellpos_session::RigFile;
+    use std::io::Write;
+    use std::os::unix::net::UnixListener;
 
     #[test]
     fn every_template_is_read_as_it_is_written() {
         let folder = tempfile::tempdir().expect("a folder");
         let found = Found {
             ports: vec!["/dev/ttyACM0".to_string(), "odd\nname".to_string()],
-            cameras: Vec::new(),
+            ..Found::default()
         };
         let real = |camera| Kind::Real {
             port: "/dev/serial/by-id/usb-board".to_string(),
@@ -195,6 +228,51 @@ mod tests {
             if kind != Kind::Emulated {
                 assert_eq!(file.watchdogs_ms(), [None, Some(2000)]);
             }
+        }
+    }
+
+    #[test]
+    fn the_origin_is_the_middle_of_the_pictures_that_the_camera_sends() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let socket = folder.path().join("camera.sock");
+        let camera = camera(&socket.display().to_string());
+        assert_eq!(width_px(&camera), None, "nobody serves it");
+        let listener = UnixListener::bind(&socket).expect("bound");
+        let server = std::thread::spawn(move || {
+            let header = FrameHeader {
+                frame_id: 1,
+                mid_exposure_ns: 1,
+                sent_ns: 2,
+                exposure_ns: 1,
+                width: 128,
+                height: 64,
+                bits: 8,
+            };
+            let (mut stream, _) = listener.accept().expect("a client");
+            let frame = [&header.to_bytes()[..], &[0; 128 * 64]].concat();
+            stream.write_all(&frame).expect("sent");
+        });
+        let seen = width_px(&camera);
+        server.join().expect("served");
+        assert_eq!(seen, Some(128));
+        let kind = Kind::Real {
+            port: "pzt".to_string(),
+            camera,
+        };
+        for (width_px, origin_px, comment) in [
+            (seen, 63.5, "the middle of 128 px"),
+            (None, 127.5, "write the middle of your picture"),
+        ] {
+            let found = Found {
+                width_px,
+                ..Found::default()
+            };
+            let path = folder.path().join("rig.toml");
+            let text = text(&kind, &found);
+            assert!(text.contains(comment), "{text}");
+            std::fs::write(&path, text).expect("written");
+            let file = RigFile::load(Some(&path)).unwrap_or_else(|error| panic!("{error:?}"));
+            assert_eq!(file.calibration.expect("there").origin_px, origin_px);
         }
     }
 }

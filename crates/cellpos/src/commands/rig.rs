@@ -41,7 +41,7 @@ struct New {
     /// Serial port of the board; default: the first one found.
     #[arg(long, value_name = "PORT")]
     serial: Option<String>,
-    /// Socket of a camera server, or address of a GigE or USB3 Vision camera.
+    /// Socket of a camera server, or address of a GigE or USB3 Vision camera. A server that sends pictures gives the origin.
     #[arg(long, value_name = "CAMERA")]
     camera: Option<String>,
 }
@@ -77,10 +77,15 @@ pub(crate) fn run(args: Args) -> CommandResult {
 }
 
 fn new(args: New) -> CommandResult {
-    let found = Found {
+    let mut found = Found {
         ports: template::ports(),
         cameras: cameras(),
+        width_px: None,
     };
+    // Only a camera that was named: another one may serve a run.
+    found.width_px = (args.camera.as_deref())
+        .map(template::camera)
+        .and_then(|camera| template::width_px(&camera));
     let camera_asked_for = args.camera.is_some();
     let port = args.serial.or_else(|| found.ports.first().cloned());
     let camera = args.camera.or_else(|| found.cameras.first().cloned());
