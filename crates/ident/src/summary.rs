@@ -185,7 +185,7 @@ fn warnings(result: &Identification, stated_per_s: Option<f64>) -> Vec<String> {
     if beyond_noise < BEYOND_NOISE {
         out.push(format!(
             "the residuals of the best order are {:.1} times the noise (as standard deviations): the plant holds something that \
-             Eq. (4) does not; the intervals were widened by that factor",
+             Eq. (4) does not, or the delay varied while it was measured (cellpos doctor --why); the intervals were widened by that factor",
             result.selection.scale.sqrt()
         ));
     }

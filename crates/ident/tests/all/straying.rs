@@ -60,6 +60,22 @@ fn delays_that_stray_within_a_step_of_the_output_widen_the_phase_and_are_no_effe
 }
 
 #[test]
+fn a_delay_that_varies_by_more_than_a_step_is_named_as_a_cause() {
+    let mut measured = of_seed(78);
+    for (n, p) in measured.points.iter_mut().enumerate() {
+        let later_s = if n % 2 == 0 { 3e-4 } else { -3e-4 };
+        let angle = -std::f64::consts::TAU * p.frequency_hz * later_s;
+        p.response *= Complex::from_polar(1.0, angle);
+    }
+    let warnings = result(measured).warnings;
+    let said = warnings.iter().find(|w| w.contains("times the noise"));
+    assert!(
+        said.is_some_and(|w| w.contains("the delay varied")),
+        "{warnings:?}"
+    );
+}
+
+#[test]
 fn a_resonance_is_more_than_delays_that_stray() {
     let mut measured = of_seed(77);
     // 250 Hz, damping 0.1: at 200 Hz three decibels too much and 25 degrees too late.

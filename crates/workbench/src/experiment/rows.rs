@@ -297,9 +297,11 @@ impl Spoilt {
                 format!("no position for {:.2} s after {:.2} s", s(rows), s(at))
             }
             Self::Thin { lost } => format!(
-                "{:.0} % of its frames were lost or late, or their commands were: this machine does not keep the loop's time \
-                 (cellpos doctor)",
-                100.0 * lost
+                "{:.0} % of its frames showed no reliable bead, were lost or {:.2} ms late, or had late commands: look at the \
+                 picture (cellpos camera) and at the machine (cellpos doctor)",
+                100.0 * lost,
+                // Half a period.
+                500.0 * period_s
             ),
         }
     }

@@ -374,7 +374,9 @@ fn stopped(
         Trouble::Spoilt { out_of_view, .. } => {
             let first = match out_of_view {
                 true => "bring a bead into view",
-                false => "end what holds up machine or line (cellpos doctor --why)",
+                false => {
+                    "end what holds up machine, camera or line (cellpos doctor --why) or hides the bead (cellpos camera)"
+                }
             };
             Failure::Failed(miette::miette!(
                 help = format!("{first}, then {go_on}"),
