@@ -7,9 +7,9 @@
 //!
 //! | state | output | left by |
 //! |---|---|---|
-//! | disarmed | at power-up displacement; after a session, or a reset in one, at park | arm |
-//! | armed | holds where it was | first command, hold watchdog (to safe), freeze, park, disarm |
-//! | running | follows commands, within range and slew | watchdog (to holding), freeze, park, disarm |
+//! | disarmed | at power-up displacement; after a session, or a reset in one, at park | arm, park |
+//! | armed | holds where it was | first command, hold watchdog (to safe), arm, freeze, park, disarm |
+//! | running | follows commands, within range and slew | watchdog (to holding), arm with its own number, freeze, park, disarm |
 //! | holding | last zero-flow estimate | fresh command (to running), hold watchdog (to safe), arm, freeze, park, disarm |
 //! | frozen | last zero-flow estimate | arm, hold watchdog (to safe), park, disarm |
 //! | safe | ramp to park | arm, disarm |
