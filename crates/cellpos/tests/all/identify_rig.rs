@@ -72,6 +72,23 @@ fn on_the_rig_of_a_rig_toml_the_same_plant_comes_out_through_the_loop_of_track()
 }
 
 #[test]
+fn behind_a_camera_slower_than_the_loop_the_plant_is_measured_at_the_rate_of_the_camera() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = "[emulator]\nseed = 3\nrate_hz = 500.0\n";
+    rig(folder.path(), "rig.toml", text);
+    let lines = "--frames off --frequency 5Hz,20Hz,50Hz";
+    let line = format!("identify --rig rig.toml {lines} --json --out m.toml --report r.html");
+    let ran = succeed(folder.path(), &line);
+    assert!(ran.err.contains("500.0 frames/s"), "{}", ran.err);
+    let r = ran.json();
+    println!("at 500 Hz: K {}", r["parameters"]["gain_per_s"]);
+    assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.03, "{r}");
+    // The rig file keeps its loop of 1 kHz: design and track predict between frames.
+    let track = "track --rig rig.toml --model m.toml --controller lqg --target 0um --duration 3s --clock virtual --frames off --no-record";
+    succeed(folder.path(), track);
+}
+
+#[test]
 fn the_run_of_an_identification_is_kept_with_its_ticks_replays_to_the_bit_and_has_a_report() {
     let folder = tempfile::tempdir().unwrap();
     rig(folder.path(), "rig.toml", "[emulator]\nseed = 3\n");

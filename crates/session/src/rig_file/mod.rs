@@ -263,6 +263,24 @@ impl RigFile {
         }
     }
 
+    /// Runs the loop at the rate of a camera that is slower than the loop; returns the loop's own period, us, or `None` if the camera keeps
+    /// pace. The arming pulse keeps its duration as far as the period allows.
+    pub fn keep_the_pace_of_its_camera(&mut self) -> Option<f64> {
+        /// Relative difference below which two periods count as equal.
+        const EQUAL: f64 = 1e-3;
+        const LONGEST_US: f64 = 1e6;
+        let (own_us, frame_us) = (self.timing.period_us, 1e6 * self.frame_s());
+        let is_slower = frame_us > (1.0 + EQUAL) * own_us && frame_us <= LONGEST_US;
+        // The period of an actuator program is its own.
+        if !is_slower || self.actuator.period_ms().is_some() {
+            return None;
+        }
+        self.timing.period_us = frame_us;
+        let pulse_us = f64::from(self.arming.pulse_ticks) * own_us;
+        self.arming.pulse_ticks = (pulse_us / frame_us).round().max(1.0) as u32;
+        Some(own_us)
+    }
+
     fn validate(&self, path: &Path) -> Result<(), Failure> {
         let say = |table: &str, error: &dyn std::fmt::Display| {
             let message = error.to_string();

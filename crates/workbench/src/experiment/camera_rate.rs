@@ -71,12 +71,23 @@ impl InPeriods {
 
 /// The difference in a sentence, and what to do.
 pub(crate) fn other_rate(rate_hz: f64, period_ns: i64) -> Failure {
+    let loop_hz = 1e9 / period_ns as f64;
+    let remedy = if rate_hz < loop_hz {
+        format!(
+            "write rate_hz = {rate_hz:.1} in [camera] of rig.toml: the loop then measures at that rate"
+        )
+    } else {
+        format!(
+            "write rate_hz = {rate_hz:.1} in [camera] and period_us = {:.1} in [timing] of rig.toml, or set the camera to \
+             {loop_hz:.1} frames/s",
+            1e6 / rate_hz
+        )
+    };
     Failure::bad_input(
         format!(
-            "the camera gives {rate_hz:.1} frames/s and the loop runs at {:.1} /s: every frequency of the record would be wrong",
-            1e9 / period_ns as f64
+            "the camera gives {rate_hz:.1} frames/s and the loop runs at {loop_hz:.1} /s: every frequency of the record would be wrong"
         ),
-        "set the camera's rate, or period_us in [timing] of rig.toml, so that both are the same",
+        remedy,
     )
 }
 
@@ -114,6 +125,21 @@ mod tests {
             tick.mid_exposure_ns = 5_000_000 + k * period_ns + (k % 3 - 1) * 1_000_000;
             tick.frame_id = 20 * k as u64 + 7;
             assert_eq!(in_periods.count(tick).frame_id, k as u64);
+        }
+    }
+
+    #[test]
+    fn the_remedy_names_the_key_and_its_value() {
+        let said = |rate_hz| match other_rate(rate_hz, 1_000_000) {
+            Failure::BadInput(report) => report.help().map(|help| help.to_string()),
+            Failure::Failed(_) => None,
+        };
+        let slow = said(500.0).expect("a remedy");
+        assert!(slow.contains("rate_hz = 500.0"), "{slow}");
+        assert!(!slow.contains("period_us"), "{slow}");
+        let fast = said(1250.0).expect("a remedy");
+        for key in ["rate_hz = 1250.0", "period_us = 800.0"] {
+            assert!(fast.contains(key), "{fast}");
         }
     }
 

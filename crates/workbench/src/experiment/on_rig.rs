@@ -127,9 +127,10 @@ pub struct Listener<'a> {
 }
 
 impl OnRig {
-    /// A rig with a PI for its delay, made for `model`; `clock` left out: virtual where the rig is emulated.
+    /// A rig with a PI for its delay, made for `model`; `clock` left out: virtual where the rig is emulated. A record has a row per frame, so
+    /// the loop runs at the rate of a camera that is slower.
     pub fn new(
-        file: RigFile,
+        mut file: RigFile,
         model: Model,
         clock: Option<ClockKind>,
         frames: Frames,
@@ -141,6 +142,12 @@ impl OnRig {
             ClockKind::Real
         });
         let model = file.actuator.before(model);
+        if let Some(own_us) = file.keep_the_pace_of_its_camera() {
+            tracing::warn!(
+                "the loop runs at the camera's {:.1} frames/s in this measurement, not at [timing] period_us = {own_us}",
+                1.0 / file.frame_s()
+            );
+        }
         let mut controller = setup::controller("pi", &model, &file.timing, file.frame_s())?;
         // Only the rig's own limits apply: the narrower ones of a controller are for holding, not for an excitation.
         controller.limits = file.limits;
