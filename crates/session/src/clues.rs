@@ -3,7 +3,7 @@
 use crate::words::is_odd;
 use cellpos_rig::{ActuatorFault as Fault, ActuatorState as State};
 use cellpos_runtime::Event;
-use cellpos_runtime::life::{EventKind, Refusal, SafeReason};
+use cellpos_runtime::life::{EventKind, FreezeReason, Refusal, SafeReason};
 use cellpos_runtime::realtime::Conditions;
 
 /// The last event of each kind that explains the end of a run.
@@ -15,6 +15,8 @@ pub(crate) struct Clues {
     pub(crate) board: Option<(State, Fault)>,
     pub(crate) late_us: Option<f64>,
     pub(crate) stale_ms: Option<f64>,
+    /// The bead is frozen because the camera repeats one picture.
+    pub(crate) picture_frozen: bool,
     pub(crate) vision_ms: Option<[f64; 2]>,
     /// Displacement beyond which the bead does not follow, um.
     pub(crate) clipped_um: Option<f64>,
@@ -38,6 +40,10 @@ impl Clues {
             EventKind::BoardChanged { state, fault } => self.board = Some((state, fault)),
             EventKind::LateTick { compute_us } => self.late_us = Some(compute_us),
             EventKind::FrameStale { age_ms } => self.stale_ms = Some(age_ms),
+            EventKind::FreezeStarted {
+                reason: FreezeReason::PictureFrozen,
+            } => self.picture_frozen = true,
+            EventKind::FreezeEnded { .. } => self.picture_frozen = false,
             EventKind::VisionSlowStarted {
                 vision_ms,
                 period_ms,
@@ -66,7 +72,7 @@ impl Clues {
         let of_times = matches!(
             reason,
             Some(SafeReason::StaleFrames | SafeReason::VisionSlow | SafeReason::LinkLost)
-        );
+        ) && !self.picture_frozen;
         let skipped = (self.skipped_ns.zip(self.safe_ns))
             .is_some_and(|(skipped, safe)| safe - skipped < RECENT_NS);
         let policy = conditions.policy.as_str();

@@ -306,6 +306,11 @@ impl Clues {
                 format!("one every {} ms", timing.period_us * 1e-3),
                 "check cable, power and trigger of the camera (see cellpos camera)",
             ),
+            SafeReason::StaleFrames if self.picture_frozen => sentences(
+                format!(" ({lost_ms:.0} ms of one picture)"),
+                "a new picture in each frame",
+                "the camera repeats one picture: restart it, or its server",
+            ),
             SafeReason::StaleFrames => sentences(
                 format!(" (more than {in_a_row}{})", last(self.stale_ms, "ms old")),
                 format!("new frames not older than {} ms", timing.oldest_ms),

@@ -96,6 +96,8 @@ fn equal_pictures_are_no_frames_and_no_success() {
         2,
     );
     assert_eq!(long.json["safe_reason"], "stale-frames", "{}", long.json);
+    let seen = long.json["ended"]["seen"].to_string();
+    assert!(seen.contains("(1000 ms of one picture)"), "{seen}");
     let frozen = long.events.iter().find(|e| e["event"] == "freeze-started");
     assert_eq!(frozen.unwrap()["data"]["reason"], "picture-frozen");
     // From the third equal picture on the PZT stays at zero flow.
