@@ -86,6 +86,11 @@ fn behind_a_camera_slower_than_the_loop_the_plant_is_measured_at_the_rate_of_the
     // The rig file keeps its loop of 1 kHz: design and track predict between frames.
     let track = "track --rig rig.toml --model m.toml --controller lqg --target 0um --duration 3s --clock virtual --frames off --no-record";
     succeed(folder.path(), track);
+    let beyond = "identify --rig rig.toml --frequency 5Hz,300Hz --out n.toml --report n.html";
+    let refused = cellpos(folder.path(), beyond);
+    assert_eq!(refused.code, Some(2), "{}", refused.err);
+    let said = message(&refused);
+    assert!(said.contains("0.2Hz and 240Hz at 500 frames"), "{said}");
 }
 
 #[test]

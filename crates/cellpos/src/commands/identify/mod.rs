@@ -239,23 +239,38 @@ fn on_rig(args: &Args, model: &Model) -> Result<Option<OnRig>, Failure> {
     OnRig::new(file, model.clone(), args.clock, frames, args.best_effort).map(Some)
 }
 
-fn job(args: &Args) -> Result<identification::Job, Failure> {
-    let model = Model::load(&args.model).map_err(Failure::input)?;
-    let rig = on_rig(args, &model)?;
-    let period_us = rig.as_ref().map_or(1000.0, |rig| rig.file.timing.period_us);
+/// The frequencies to excite in a loop of this period, ascending.
+fn lines_hz(args: &Args, period_us: f64) -> Result<Vec<f64>, Failure> {
+    /// Highest frequency of `--frequency`, as a fraction of the loop's rate.
+    const BAND: f64 = 0.48;
+    let rate_hz = 1e6 / period_us;
     let mut lines_hz: Vec<f64> = if !args.frequency.is_empty() {
         args.frequency.iter().map(|f| f.0).collect()
     } else if period_us > SLOW_LOOP_US {
-        let highest_hz = HIGHEST_LINE * 1e6 / period_us;
-        SLOW_FREQUENCIES_HZ
-            .into_iter()
-            .filter(|hz| *hz < highest_hz)
-            .collect()
+        let of_slow = SLOW_FREQUENCIES_HZ.into_iter();
+        of_slow.filter(|hz| *hz < HIGHEST_LINE * rate_hz).collect()
     } else {
         PAPER_FREQUENCIES_HZ.to_vec()
     };
     lines_hz.sort_by(f64::total_cmp);
     lines_hz.dedup();
+    if let Some(hz) = lines_hz.last().filter(|hz| **hz >= BAND * rate_hz) {
+        return Err(Failure::bad_input(
+            format!("--frequency {hz}Hz: outside the band"),
+            format!(
+                "lines lie between 0.2Hz and {:.0}Hz at {rate_hz:.0} frames a second",
+                BAND * rate_hz
+            ),
+        ));
+    }
+    Ok(lines_hz)
+}
+
+fn job(args: &Args) -> Result<identification::Job, Failure> {
+    let model = Model::load(&args.model).map_err(Failure::input)?;
+    let rig = on_rig(args, &model)?;
+    let period_us = rig.as_ref().map_or(1000.0, |rig| rig.file.timing.period_us);
+    let lines_hz = lines_hz(args, period_us)?;
     let seed = args
         .seed
         .or(rig.as_ref().map(|rig| rig.file.emulator.seed))
