@@ -1,7 +1,7 @@
 //! Settings of the tracker, and its statements about each frame.
 
 use crate::config::ConfigError;
-use crate::fix::Fix;
+use crate::fix::{Fix, FixQuality};
 use serde::{Deserialize, Serialize};
 
 /// The commanded motion up to the next frame.
@@ -268,6 +268,17 @@ pub enum Decision {
 }
 
 impl Decision {
+    /// The decision for a fix that cannot be used.
+    pub(super) fn refusing(verdict: FixQuality) -> Self {
+        match verdict {
+            FixQuality::NoSignal => Decision::NoSignal,
+            FixQuality::BadFit => Decision::Merged,
+            FixQuality::AtBorder => Decision::AtBorder,
+            FixQuality::NotConverged => Decision::NotConverged,
+            FixQuality::Good => Decision::OtherBead,
+        }
+    }
+
     /// The decision of a number in a record.
     pub fn from_number(number: u8) -> Option<Self> {
         use Decision::*;

@@ -16,6 +16,7 @@ mod look;
 mod motion;
 mod neighbours;
 mod rejected;
+mod scenery;
 mod standing;
 mod stays;
 mod touching;
@@ -32,6 +33,7 @@ use identity::Identity;
 use motion::{Motion, Randomness};
 use neighbours::{Candidate, Claim, MAX_BEADS, Neighbours};
 use rejected::Rejected;
+use scenery::Scenery;
 use standing::{Chosen as Sighted, Standing};
 
 /// Frames between measurements of the size while tracking.
@@ -75,6 +77,9 @@ pub struct Tracker {
     /// A look beside the bead, which was taken without it.
     owed: Option<Owed>,
     rejected: Rejected,
+    /// What stands still in the picture, and whether this frame is to be learnt.
+    scenery: Scenery,
+    learns: bool,
     /// Share of what may be that the last fixes have used, and whether the end is near.
     used: f64,
     near_limit: bool,
@@ -104,6 +109,8 @@ impl Tracker {
             beside: Beside::default(),
             owed: None,
             rejected: Rejected::default(),
+            scenery: Scenery::new(),
+            learns: false,
             used: 0.0,
             near_limit: false,
         })
@@ -123,6 +130,7 @@ impl Tracker {
     /// the operator's way to settle what the tracker calls ambiguous.
     pub fn choose(&mut self, aim: Option<(f64, f64)>) {
         self.aim = aim;
+        self.scenery.forget();
         self.search_anew();
     }
 
@@ -190,7 +198,9 @@ impl Tracker {
         self.neighbours
             .predict(dt_s, flow_px_per_s, &self.randomness);
         let before = self.chosen;
-        let (decision, fix) = match (frame, self.chosen) {
+        let mut scenery = std::mem::take(&mut self.scenery);
+        let seen = frame.map(|frame| scenery.without(*frame));
+        let (decision, fix) = match (&seen, self.chosen) {
             (None, _) => (Decision::NoFrame, None),
             (Some(frame), None) => self.search(frame, time_s),
             (Some(frame), Some(chosen)) if chosen.confirmed < self.config.confirm_frames => {
@@ -198,6 +208,7 @@ impl Tracker {
             }
             (Some(frame), Some(chosen)) => self.follow(frame, chosen, time_s),
         };
+        self.scenery = scenery;
         let decision = match decision {
             Decision::Accepted if self.near_limit => Decision::NearLimit,
             other => other,
@@ -210,6 +221,9 @@ impl Tracker {
         let (before, now) = (before.map(sighted), self.chosen.map(sighted));
         let limit_s = self.config.coast_limit_s;
         let step = self.standing.settle(decision, fix, before, now, limit_s);
+        self.learns = step.state == TrackState::Tracking
+            && decision.is_accepted()
+            && self.frames.is_multiple_of(self.config.neighbour_stride);
         TrackStep {
             neighbours: self.neighbours.count() as u8,
             ..step
@@ -245,7 +259,7 @@ impl Tracker {
             let seen = self.candidates.iter().flatten().next().map(|c| c.fix);
             let decision = |fix: Fix| match fix.verdict {
                 FixQuality::Good => Decision::Stays,
-                verdict => refusal(verdict),
+                verdict => Decision::refusing(verdict),
             };
             return (seen.map_or(Decision::NothingFound, decision), seen);
         };
@@ -295,7 +309,7 @@ impl Tracker {
         }
         // Not a bead that stays: search again with the next frame.
         self.chosen = None;
-        (refusal(fix.verdict), Some(fix))
+        (Decision::refusing(fix.verdict), Some(fix))
     }
 
     fn follow(&mut self, frame: &Frame, chosen: Chosen, time_s: f64) -> (Decision, Option<Fix>) {
@@ -353,7 +367,7 @@ impl Tracker {
             if nearer {
                 nearest = Some(c.fix);
                 misfit = Some(if c.fix.verdict != FixQuality::Good {
-                    refusal(c.fix.verdict)
+                    Decision::refusing(c.fix.verdict)
                 } else if !self.within_reach(&chosen.motion, &c.fix) {
                     Decision::OutsideGate
                 } else {
@@ -477,16 +491,5 @@ impl Tracker {
         let (x, y) = motion.way_to(fix);
         f64::hypot(x, y) <= self.config.fastest_flow_px_per_s * motion.since_s()
             || self.within_gate(motion, fix)
-    }
-}
-
-/// The decision for a fix that cannot be used.
-fn refusal(verdict: FixQuality) -> Decision {
-    match verdict {
-        FixQuality::NoSignal => Decision::NoSignal,
-        FixQuality::BadFit => Decision::Merged,
-        FixQuality::AtBorder => Decision::AtBorder,
-        FixQuality::NotConverged => Decision::NotConverged,
-        FixQuality::Good => Decision::OtherBead,
     }
 }

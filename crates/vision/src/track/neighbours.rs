@@ -183,6 +183,24 @@ impl Neighbours {
         self.beads.iter().flatten().count()
     }
 
+    /// Those that may swim beside a bead that moves as `ours`: where, and how well that is known, px.
+    pub(super) fn swimming(&self, ours: &Motion) -> impl Iterator<Item = ((f64, f64), f64)> {
+        let swimming = self.beads.iter().flatten().filter(|n| !n.is_standing);
+        swimming.map(|n| {
+            let motion = n.beside(ours);
+            (motion.position(), motion.sd_px())
+        })
+    }
+
+    /// Forgets those that surely stand at a place that is known otherwise.
+    pub(super) fn leave_standing(&mut self, is_known: impl Fn((f64, f64)) -> bool) {
+        for slot in &mut self.beads {
+            if slot.is_some_and(|n| n.is_standing && is_known(n.stand.position())) {
+                *slot = None;
+            }
+        }
+    }
+
     pub(super) fn predict(
         &mut self,
         dt_s: f64,
