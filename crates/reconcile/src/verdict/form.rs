@@ -150,12 +150,13 @@ fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64])
         .collect();
     // In the set without it, parts behind it have moved up.
     let moved: Vec<usize> = larger.iter().map(|&k| k - usize::from(k > i)).collect();
-    let first = gain_of_freer(ctx, without, &moved);
     // A number that no rig shows asks for less.
-    if prior_penalty(&fit.parts[i], 0.0) > 0.0 && first > THRESHOLDS.companion_untypical * gained {
-        return true;
-    }
-    first > gained && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
+    let share = match prior_penalty(&fit.parts[i], 0.0) > 0.0 {
+        true => THRESHOLDS.companion_untypical,
+        false => 1.0,
+    };
+    gain_of_freer(ctx, without, &moved) > share * gained
+        && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
 }
 
 /// The gain in twice the log-likelihood by freer forms of some parts of a fit, beyond chance; None if they have no such forms.
