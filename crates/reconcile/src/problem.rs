@@ -57,11 +57,13 @@ fn row_at(change: &[f64], share: f64) -> usize {
 }
 
 fn before(cuts: &[(usize, usize)]) -> Mask {
-    cuts.iter().map(|(cut, _)| vec![0..*cut]).collect()
+    let of = |(cut, _): &(usize, usize)| std::iter::once(0..*cut).collect();
+    cuts.iter().map(of).collect()
 }
 
 fn after(cuts: &[(usize, usize)]) -> Mask {
-    cuts.iter().map(|(cut, rows)| vec![*cut..*rows]).collect()
+    let of = |(cut, rows): &(usize, usize)| std::iter::once(*cut..*rows).collect();
+    cuts.iter().map(of).collect()
 }
 
 /// One record, ready.
@@ -462,9 +464,10 @@ mod tests {
             .map(|k| f64::from(u8::from((600..700).contains(&k))))
             .collect();
         let [late, early] = splits_of(&[few, vec![0.0; 10]]);
-        assert_eq!(late.0, [vec![0..660], vec![0..6]]);
-        assert_eq!(late.1, [vec![660..1000], vec![6..10]]);
-        assert_eq!(early.0, [vec![640..1000], vec![4..10]]);
-        assert_eq!(early.1, [vec![0..640], vec![0..4]]);
+        let one_each = |of: [Range<usize>; 2]| of.map(|rows| Vec::from_iter([rows]));
+        assert_eq!(late.0, one_each([0..660, 0..6]));
+        assert_eq!(late.1, one_each([660..1000, 6..10]));
+        assert_eq!(early.0, one_each([640..1000, 4..10]));
+        assert_eq!(early.1, one_each([0..640, 0..4]));
     }
 }
