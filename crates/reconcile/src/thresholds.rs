@@ -60,9 +60,6 @@ pub struct Thresholds {
     /// An addition smaller than [`Self::addition_share`] must gain this many times the usual least gain. Pinned by
     /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
     pub small_gain: f64,
-    /// A hysteresis gets no name if a curve without memory in front of the plant explains this share of it. For relays that share
-    /// is 0.4 to 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
-    pub curve_share: f64,
     /// Rows of rest or of repeated command that give the noise to a few percent, and rows in all that can separate effects.
     pub floor_rows: usize,
     /// A command counts as at rest where its range is below this part of the range of all records: a measured input is
@@ -76,9 +73,6 @@ pub struct Thresholds {
     pub stated_excess: f64,
     /// Trials of the search by which a probability is multiplied: variants, starts, pixel sizes. Pinned with `addition_noise`.
     pub trials: f64,
-    /// How far a line must stand above its neighbours, in power. Pinned by `leak_and_hum_together_are_both_named` and, from the other
-    /// side, by `records_that_hide_nothing_get_no_name`.
-    pub line_above: f64,
     /// Price, in twice the log-likelihood, of a main parameter outside the range that rigs show: decides ties between names.
     pub untypical: f64,
     /// The same, as a share of the residual of a fit: if a fit is wrong elsewhere, its last percent decides little.
@@ -146,13 +140,11 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     companion_rest: 0.1,
     companion_untypical: 0.5,
     small_gain: 4.0,
-    curve_share: 0.95,
     floor_rows: 400,
     rest_share: 1e-3,
     repeat_share: 0.14,
     stated_excess: 0.1,
     trials: 2000.0,
-    line_above: 10.0,
     untypical: 12.0,
     untypical_share: 0.2,
     walk_alike: 0.3,

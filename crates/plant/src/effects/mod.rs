@@ -80,7 +80,7 @@ pub use pzt_resonance::pzt_resonance;
 pub use saturation::saturation;
 pub use slew_limit::slew_limit;
 pub use stick_slip::stick_slip;
-pub use stiffening::stiffening;
+pub use stiffening::{stiffening, stiffening_by_square};
 pub use table::{all, built_in, find, ids, register};
 pub use time_delay::time_delay;
 pub use user::{
@@ -177,9 +177,9 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
-    /// The candidate with the static curve of the effect but no memory, if any.
-    fn memoryless(&self) -> Option<usize> {
-        None
+    /// Whether its output depends on where its input turned, as that of a hysteresis does.
+    fn remembers_turns(&self) -> bool {
+        false
     }
 
     /// Other candidates with the numbers of this one, in equations that few records tell from its own.

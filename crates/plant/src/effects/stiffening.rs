@@ -7,7 +7,24 @@ use super::{
 
 /// Stiffening of the chip: the displacement that acts is `u + per_um2 u^3`, from the working point.
 pub fn stiffening(per_um2: f64) -> Effect {
-    Effect::new(&KIND, 0, &[per_um2], &[])
+    Effect::new(&KIND, CUBE, &[per_um2], &[])
+}
+
+/// The same by the square: `u + per_um u |u|`.
+pub fn stiffening_by_square(per_um: f64) -> Effect {
+    Effect::new(&KIND, SQUARE, &[per_um], &[])
+}
+
+/// Indices of the forms.
+const CUBE: usize = 0;
+const SQUARE: usize = 1;
+
+/// By which power of the displacement the gain of a form grows.
+fn power(form: usize) -> i32 {
+    match form {
+        SQUARE => 1,
+        _ => 2,
+    }
 }
 
 #[derive(Debug)]
@@ -19,12 +36,19 @@ static SPEC: Spec = Spec {
     id: "stiffening",
     place: Place::Chip,
     shown_at: "",
-    equation: "u + c u^3",
+    equation: "u + c u^3, or u + c u |u|",
     signature: "odd harmonics that grow with the square of the amplitude at all frequencies, no lag",
     ahead_of_plant: true,
-    forms: &[Form::only(&[ParameterSpec::new(
-        "per_um2", "1/um^2", -10.0, 10.0,
-    )])],
+    forms: &[
+        Form {
+            name: "cube",
+            ..Form::only(&[ParameterSpec::new("per_um2", "1/um^2", -10.0, 10.0)])
+        },
+        Form {
+            name: "square",
+            ..Form::only(&[ParameterSpec::new("per_um", "1/um", -10.0, 10.0)])
+        },
+    ],
     confused_with: &["pzt-hysteresis", "saturation"],
     inseparable_from: &[],
     experiment: Experiment::Amplitudes,
@@ -37,8 +61,9 @@ impl EffectKind for Stiffening {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Block(Box::new(Cubic {
-            per_um2: effect.scalar(0),
+        Action::Block(Box::new(Stiff {
+            share: effect.scalar(0),
+            power: power(effect.form_index()),
         }))
     }
 
@@ -52,32 +77,42 @@ impl EffectKind for Stiffening {
 
     fn candidates(&self) -> &'static [Candidate] {
         // Softening is excluded: it would fit the round knee of a saturation.
-        const ALL: &[Candidate] =
-            &[Candidate::chain(&[lin("per_um2", 0.0, 0.5, 1e-4)]).typical(0.0, 0.3)];
+        const ALL: &[Candidate] = &[
+            Candidate {
+                name: "cube",
+                ..Candidate::chain(&[lin("per_um2", 0.0, 0.5, 1e-4)]).typical(0.0, 0.3)
+            },
+            Candidate {
+                name: "square",
+                ..Candidate::chain(&[lin("per_um", 0.0, 1.0, 1e-4)]).typical(0.0, 0.3)
+            },
+        ];
         ALL
     }
 
-    fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
+    fn starts(&self, form: usize, scope: &Scope) -> Vec<Vec<f64>> {
+        let power = power(form);
         [0.02, 0.1]
             .iter()
-            .map(|c| vec![c / scope.stroke_um.powi(2).max(1e-6)])
+            .map(|c| vec![c / scope.stroke_um.powi(power).max(1e-6)])
             .collect()
     }
 
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
+    fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
+        Effect::new(self, form, values, &[])
     }
 }
 
-/// `u + per_um2 u^3`.
+/// `u + share |u|^power u`.
 #[derive(Debug, Clone)]
-struct Cubic {
-    per_um2: f64,
+struct Stiff {
+    share: f64,
+    power: i32,
 }
 
-impl Block for Cubic {
+impl Block for Stiff {
     fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
-        let at = |u: f64| u + self.per_um2 * u.powi(3);
+        let at = |u: f64| u + self.share * u.abs().powi(self.power) * u;
         Piece::line(at(input.start), at(input.end), h_s)
     }
 

@@ -38,6 +38,7 @@ pub(crate) fn one_of_each() -> Vec<Effect> {
         effects::frame_drops(0.01),
         effects::frame_repeats(1e-300),
         effects::stiffening(0.05),
+        effects::stiffening_by_square(0.05),
         effects::gain_swing(0.1, 7.0, 30.0),
         effects::valve_asymmetry(0.01),
         effects::stick_slip(40.0, 8.0),

@@ -18,6 +18,12 @@ pub(crate) fn threshold(freedom: usize) -> f64 {
     THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, CHANCE_SD)
 }
 
+/// What a further response to the command must gain beside what explains `gained` already: beyond chance, and beyond the difference
+/// between the equations and nature's.
+pub(crate) fn least_gain(freedom: usize, gained: f64) -> f64 {
+    threshold(freedom).max(THRESHOLDS.addition_share * gained)
+}
+
 /// Least gain of the best of this number of waves, each with its sine and cosine: the tail of chi-square with two degrees is
 /// `exp(-x/2)`.
 pub(crate) fn threshold_of_waves(tried: usize) -> f64 {

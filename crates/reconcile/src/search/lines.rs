@@ -5,8 +5,6 @@ use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
 use crate::search::cost::threshold_of_waves;
-use crate::search::suspect::line_score;
-use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::{FitParameter, Role};
 use realfft::RealFftPlanner;
 use realfft::num_complex::Complex;
@@ -173,83 +171,11 @@ const PARTS_OF_RECORD: usize = 4;
 /// variance), noise takes a line below that once in some five hundred times.
 const STOPPED: f64 = 0.25;
 
-/// The frequency of the strongest line in the innovations that is on no line of the command, if any stands out.
+/// The frequency of the strongest line in the innovations that lasts, Hz. In a loop the command has it as well, and answers it.
 pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
-    let mask = ctx.problem.all();
-    let coarse: Vec<f64> = (0..480)
-        .map(|i| 3.05 + f64::from(i))
-        .filter(|f| f * ctx.problem.base.sample_s < 0.48)
-        .collect();
-    // The longest record decides; a line is everywhere.
-    let longest = (0..ctx.problem.records.len()).max_by_key(|i| ctx.problem.records[*i].u.len())?;
-    let e = &fit.innovations[longest];
-    let n = e.len().min(4000);
-    let dt = ctx.problem.base.sample_s;
-    let mut found: Vec<(f64, f64)> = Vec::new();
-    let least = threshold_of_waves(coarse.len() * PARTS as usize);
-    for f in coarse {
-        for part in 0..PARTS {
-            let hz = f + f64::from(part) / f64::from(PARTS);
-            let (mut s, mut c) = (0.0, 0.0);
-            for (k, e) in e[..n].iter().enumerate() {
-                let (a, b) = (TAU * hz * k as f64 * dt).sin_cos();
-                s += a * e;
-                c += b * e;
-            }
-            let p = 2.0 * (s * s + c * c) / n as f64;
-            if p > least {
-                found.push((hz, p));
-            }
-        }
-    }
-    found.sort_by(|a, b| b.1.total_cmp(&a.1));
-    found.truncate(MOST_TRIED);
-    let command = &ctx.problem.records[longest].u[..n];
-    let best = found.into_iter().find(|(hz, _)| {
-        stands_out(&e[..n], *hz, dt)
-            && !(1..=HARMONICS).any(|k| stands_out(command, hz / f64::from(k), dt))
-    })?;
-    let fine = (0..41).map(|i| best.0 - 0.1 + f64::from(i) * 0.005);
-    fine.map(|hz| (hz, line_score(ctx, fit, hz, &mask)))
-        .max_by(|a, b| a.1.total_cmp(&b.1))
-        .map(|b| b.0)
-}
-
-/// Frequencies per hertz.
-const PARTS: u32 = 8;
-/// Frequencies that are looked at, strongest first.
-const MOST_TRIED: usize = 100;
-/// A response that bends answers at multiples of the command's lines: up to this one.
-const HARMONICS: u32 = 5;
-
-/// Power at a frequency under a window that keeps strong neighbours out.
-fn power(x: &[f64], hz: f64, dt: f64) -> f64 {
-    let n = x.len() as f64;
-    let (mut s, mut c) = (0.0, 0.0);
-    for (k, x) in x.iter().enumerate() {
-        let window = 1.0 - (TAU * k as f64 / n).cos();
-        let (a, b) = (TAU * hz * k as f64 * dt).sin_cos();
-        s += a * window * x;
-        c += b * window * x;
-    }
-    s * s + c * c
-}
-
-/// Whether a series has a line at a frequency: more there than at the neighbouring frequencies that it can be distinguished from.
-fn stands_out(x: &[f64], hz: f64, dt: f64) -> bool {
-    let bin = 1.0 / (x.len() as f64 * dt);
-    let peak = [-1.0, -0.5, 0.0, 0.5, 1.0]
-        .iter()
-        .map(|d| power(x, hz + d * bin, dt))
-        .fold(0.0, f64::max);
-    let mut around: Vec<f64> = (4..12)
-        .flat_map(|i| [-f64::from(i), f64::from(i)])
-        .map(|i| hz + i * bin)
-        .filter(|f| *f > 0.0)
-        .map(|f| power(x, f, dt))
-        .collect();
-    around.sort_by(f64::total_cmp);
-    around
-        .get(around.len() / 2)
-        .is_some_and(|median| peak > THRESHOLDS.line_above * median)
+    /// Slower ones a walk hides.
+    const LOWEST_HZ: f64 = 3.0;
+    let highest_hz = 0.48 / ctx.problem.base.sample_s;
+    let spectra = Spectra::of(ctx, fit, &ctx.problem.all(), highest_hz)?;
+    spectra.strongest(1, LOWEST_HZ..highest_hz)
 }

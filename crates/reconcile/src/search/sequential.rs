@@ -5,7 +5,7 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::problem::Mask;
 use crate::search::cost::{
-    before_forms, gap, leaves_much, left_over, penalised_cost, threshold, threshold_of,
+    before_forms, gap, least_gain, leaves_much, left_over, penalised_cost, threshold_of,
 };
 use crate::search::effort::Effort;
 use crate::search::screen::screen;
@@ -147,12 +147,12 @@ fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
         .iter()
         .filter(|p| !smaller.has(p.id()))
         .all(|p| p.variant().off_response);
-    let least = if off_response {
+    let gained = if off_response {
         0.0
     } else {
-        THRESHOLDS.addition_share * (null - smaller.chi2).max(0.0)
+        null - smaller.chi2
     };
-    smaller.chi2 - bigger.chi2 > threshold(added).max(least)
+    smaller.chi2 - bigger.chi2 > least_gain(added, gained)
 }
 
 /// Takes back effects that are no longer needed.
@@ -164,10 +164,9 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: &Fit, mask: &Mask, effort: E
             let mut parts = fit.parts.clone();
             parts.remove(i);
             // Only whether it comes so far down that the part was worth nothing is asked.
-            let least = THRESHOLDS.addition_share * (null - fit.chi2);
             let until = Until {
                 iterations: 8,
-                least_chi2: fit.chi2 + threshold(fit.freedom()).max(least),
+                least_chi2: fit.chi2 + least_gain(fit.freedom(), null - fit.chi2),
             };
             ctx.fit_towards(parts, Some(fit.soft), mask, until)
         });

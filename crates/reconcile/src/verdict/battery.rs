@@ -5,7 +5,7 @@ use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::{Mask, split_in_time};
-use crate::search::lines::{strongest_line, without_line};
+use crate::search::lines::{Line, strongest_line, without_line};
 use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
 use crate::units::Side;
@@ -361,15 +361,68 @@ fn beside(library: &[Column], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<V
         .collect()
 }
 
-/// Forward selection on the first part of every record; each term must also help in the rest.
+/// What a formula must gain on rows that it has not seen, in twice the log-likelihood, beside a simpler one.
+const UNSEEN: f64 = 10.0;
+
+/// A formula, and what it leaves of the innovations.
+struct Selected {
+    line: Option<Line>,
+    /// Places in the library, with their coefficients.
+    terms: Vec<(usize, f64)>,
+    left: Vec<Vec<f64>>,
+}
+
+/// The formula for what a fit leaves, with a line that has a separate amplitude and phase in every record if that says more. A response
+/// that is off makes lines of the command's sines as well, and its terms say as much.
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
     let (train, test) = split_in_time(&ctx.problem.records);
-    let all = &fit.innovations;
-    // A line first, with a separate amplitude and phase in every record.
-    let line = strongest_line(ctx, fit)
+    let squares = |e: &[Vec<f64>]| inner(e, e, &test);
+    let plain = selected(ctx, fit, library, None);
+    let with_line = strongest_line(ctx, fit)
         .and_then(|hz| without_line(ctx, fit, hz, &train))
-        .filter(|l| inner(&l.left, &l.left, &test) < inner(all, all, &test) - 10.0);
-    let e = line.as_ref().map_or(all, |l| &l.left);
+        .and_then(|line| selected(ctx, fit, library, Some(line)))
+        .filter(|found| {
+            let simpler = plain.as_ref().map_or(&fit.innovations, |p| &p.left);
+            squares(&found.left) < squares(simpler) - UNSEEN
+        });
+    let found = with_line.or(plain)?;
+    let count = ctx.problem.count(&test) as f64;
+    let before = squares(&fit.innovations) - count;
+    let after = squares(&found.left) - count;
+    let line = found.line.map(|l| Term {
+        term: format!("sin(2 pi {:.2} Hz t + phase of the record)", l.hz),
+        place: "output",
+        coefficient: ctx.scales.output(l.amplitude_um),
+        unit: ctx.scales.output_unit().to_owned(),
+    });
+    let of_library = (found.terms.iter()).map(|(i, x)| term_of(ctx, &library[*i], *x));
+    let terms: Vec<Term> = line.into_iter().chain(of_library).collect();
+    let words = terms.iter().map(|t| {
+        format!(
+            "{} += {:.4e} [{}] {}",
+            t.place, t.coefficient, t.unit, t.term
+        )
+    });
+    Some(Hypothesis {
+        formula: words.collect::<Vec<_>>().join(", "),
+        held_out_worth: if before > 0.0 {
+            (1.0 - after / before).clamp(-1.0, 1.0)
+        } else {
+            0.0
+        },
+        terms,
+    })
+}
+
+/// Forward selection on the first part of every record, beside a line if any; each term must also help in the rest.
+fn selected(
+    ctx: &Context<'_>,
+    fit: &Fit,
+    library: &[Column],
+    line: Option<Line>,
+) -> Option<Selected> {
+    let (train, test) = split_in_time(&ctx.problem.records);
+    let e = line.as_ref().map_or(&fit.innovations, |l| &l.left);
     // A base that was fitted to records of a plant that bends has another gain and lag than the plant: what these change is no term.
     let straight = straight(ctx, library, &train);
     let (columns, e) = (
@@ -421,43 +474,17 @@ pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Op
                 next.iter_mut().zip(c).for_each(|(n, c)| *n -= x * c);
             }
         }
-        if inner(&next, &next, &test) > inner(&left, &left, &test) - 10.0 {
+        if inner(&next, &next, &test) > inner(&left, &left, &test) - UNSEEN {
             break;
         }
         (chosen, coefficients, left) = (trial, x, next);
     }
-    if chosen.is_empty() && line.is_none() {
-        return None;
-    }
-    let count = ctx.problem.count(&test) as f64;
-    let before = inner(all, all, &test) - count;
-    let after = inner(&left, &left, &test) - count;
-    let line = line.map(|l| Term {
-        term: format!("sin(2 pi {:.2} Hz t + phase of the record)", l.hz),
-        place: "output",
-        coefficient: ctx.scales.output(l.amplitude_um),
-        unit: ctx.scales.output_unit().to_owned(),
-    });
-    let of_library =
-        (chosen.iter().zip(coefficients.iter())).map(|(i, x)| term_of(ctx, &library[*i], *x));
-    let terms: Vec<Term> = line.into_iter().chain(of_library).collect();
-    let formula = terms
-        .iter()
-        .map(|t| {
-            format!(
-                "{} += {:.4e} [{}] {}",
-                t.place, t.coefficient, t.unit, t.term
-            )
-        })
-        .collect::<Vec<_>>()
-        .join(", ");
-    Some(Hypothesis {
-        formula,
-        held_out_worth: if before > 0.0 {
-            (1.0 - after / before).clamp(-1.0, 1.0)
-        } else {
-            0.0
-        },
-        terms,
+    (!chosen.is_empty() || line.is_some()).then(|| Selected {
+        line,
+        terms: chosen
+            .into_iter()
+            .zip(coefficients.iter().copied())
+            .collect(),
+        left,
     })
 }

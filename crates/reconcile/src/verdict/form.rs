@@ -8,9 +8,9 @@
 
 use crate::dot::dot;
 use crate::fit::catalogue::Part;
-use crate::fit::context::{Context, Fit};
+use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::linear::Columns;
-use crate::search::cost::{gap, penalised_cost, prior_penalty};
+use crate::search::cost::{gap, least_gain, penalised_cost, prior_penalty};
 use crate::search::sequential::Found;
 use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
@@ -64,7 +64,7 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         };
         // What is small is a form of the others.
         let is_large = worth[i] >= THRESHOLDS.companion_share;
-        if is_large && let Some(fit) = in_its_stead(ctx, found, i, &without[i]) {
+        if is_large && let Some(fit) = in_its_stead(ctx, found, i) {
             found.fit = fit;
             let taken = found.fit.parts[i].id();
             found.rivals[i].retain(|r| r.id != taken);
@@ -83,23 +83,21 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
     aside
 }
 
-/// The set with a rival in place of a hysteresis without memory: one that explains as much as a static curve does. A gain is such a
+/// The set with the best rival in place of a hysteresis without memory, which explains no more than a static curve. A gain is such a
 /// curve.
-fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize, without: &Fit) -> Option<Fit> {
-    found.fit.parts[i].variant.memoryless()?;
-    let least = THRESHOLDS.curve_share * (without.chi2 - found.fit.chi2);
+fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize) -> Option<Fit> {
+    if !found.fit.parts[i].variant.remembers_turns() {
+        return None;
+    }
     let rivals = found.rivals.get(i)?.iter();
-    let mut fits: Vec<Fit> = rivals
-        .filter(|r| !r.is_limit && r.part.variant.memoryless().is_none())
+    let fits = rivals
+        .filter(|r| !r.is_limit && !r.part.variant.remembers_turns())
         .map(|r| {
             let mut parts = found.fit.parts.clone();
             parts[i] = r.part.clone();
             ctx.fit_from(parts, Some(found.fit.soft), &ctx.problem.all(), ROUNDS)
-        })
-        .filter(|fit| without.chi2 - fit.chi2 > least)
-        .collect();
-    fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
-    fits.into_iter().next()
+        });
+    fits.min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
 }
 
 /// Reduces a set to one effect if that effect alone, in a freer form, explains as much as the set. Within such a set no effect is
@@ -152,12 +150,13 @@ fn is_form(ctx: &Context<'_>, fit: &Fit, i: usize, without: &Fit, worth: &[f64])
         .collect();
     // In the set without it, parts behind it have moved up.
     let moved: Vec<usize> = larger.iter().map(|&k| k - usize::from(k > i)).collect();
-    let first = gain_of_freer(ctx, without, &moved);
     // A number that no rig shows asks for less.
-    if prior_penalty(&fit.parts[i], 0.0) > 0.0 && first > THRESHOLDS.companion_untypical * gained {
-        return true;
-    }
-    first > gained && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
+    let share = match prior_penalty(&fit.parts[i], 0.0) > 0.0 {
+        true => THRESHOLDS.companion_untypical,
+        false => 1.0,
+    };
+    gain_of_freer(ctx, without, &moved) > share * gained
+        && gain_of_freer(ctx, fit, &larger) > THRESHOLDS.companion_rest * gained
 }
 
 /// The gain in twice the log-likelihood by freer forms of some parts of a fit, beyond chance; None if they have no such forms.
@@ -169,15 +168,21 @@ pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> f6
     gained_beside(ctx, fit, free)
 }
 
-/// Whether a part is a hysteresis that some curve without memory in front of the plant explains as well.
+/// Whether a part is a hysteresis whose memory is not worth having beside a curve without memory in front of the plant. `without` is the
+/// set without it, `gained` what it gains. The curve takes a gain up as well: what is left to the memory may be a small part of the
+/// whole, and yet beyond doubt.
 pub(crate) fn remembers_nothing(
     ctx: &Context<'_>,
     part: &Part,
     without: &Fit,
     gained: f64,
 ) -> bool {
-    part.variant.memoryless().is_some()
-        && gained_beside(ctx, without, bends(ctx)) > THRESHOLDS.curve_share * gained
+    if !part.variant.remembers_turns() {
+        return false;
+    }
+    let curve = gained_beside(ctx, without, bends(ctx));
+    let freedom = freedom_of(part.variant(), ctx.problem.records.len());
+    gained - curve < least_gain(freedom, curve)
 }
 
 /// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.

@@ -1,8 +1,8 @@
-//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms), then the end of the time by its
-//! beginning and the reverse. An effect that acts in one part of a record alone is visible only there.
+//! The check on data not used in fitting: whole records (frequencies, amplitudes, wave forms), then the end of what an effect does in
+//! a record by its beginning and the reverse.
 
 use crate::fit::context::{Context, Fit};
-use crate::problem::{Mask, Prepared, split_from_the_end, split_in_time};
+use crate::problem::{Mask, Prepared, splits_of};
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::result::{BandGap, Interval, RecordGap};
@@ -21,8 +21,8 @@ pub(crate) struct HeldOut {
     /// The value expected from the walk and the white noise alone \[um\].
     pub free_floor_um: f64,
     pub per_record: Vec<RecordGap>,
-    /// Parts that do not help in the last 40 % and the first 40 % of the time together, each when fitted on the rest, or that one
-    /// of the two contradicts.
+    /// Parts that do not help in the last 40 % and the first 40 % of what they do together, each when fitted on the rest, or that
+    /// one of the two contradicts.
     pub unconfirmed: Vec<usize>,
     /// How far a free base gain moves when it is refitted together with the set.
     pub gain_shift: Interval,
@@ -97,13 +97,15 @@ fn free_run(ctx: &Context<'_>, null: &Fit, set: &Fit, test: &Mask) -> Sums {
 pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
     let records = &ctx.problem.records;
     let sigma = ctx.problem.noise.innovation_um();
-    let splits = [split_in_time(records), split_from_the_end(records)];
-    // Records: each predicted by a fit to all others, where those are enough; else the end of each by its beginning, and the beginning
-    // by the end.
+    let all = ctx.problem.all();
+    let null = ctx.fit(Vec::new(), &all, ROUNDS);
+    let splits = splits_of(&change(&null, fit));
+    // Records: each predicted by a fit to all others, where those are enough; else the end of what the set does in it by the beginning,
+    // and the beginning by the end.
     // Amplitudes and phases of lines are each record's own: kept.
     let folds: Vec<usize> = (0..records.len()).collect();
     let results = cellpos_numeric::parallel::map(&folds, threads, |&i| {
-        let mut others = ctx.problem.all();
+        let mut others = all.clone();
         let mut own: Mask = vec![Vec::new(); records.len()];
         std::mem::swap(&mut others[i], &mut own[i]);
         // A record at rest says nothing of a response.
@@ -149,7 +151,7 @@ pub(crate) fn check(ctx: &Context<'_>, fit: &Fit, threads: usize) -> HeldOut {
         free_after_um: free(total.free_after),
         free_floor_um: free(total.free_floor),
         per_record,
-        unconfirmed: unconfirmed(ctx, fit, &splits, threads),
+        unconfirmed: unconfirmed(ctx, fit, threads),
         gain_shift: gain_shift(ctx, fit),
     }
 }
@@ -176,31 +178,28 @@ fn fold(ctx: &Context<'_>, fit: &Fit, others: &Mask, own: &Mask) -> Sums {
     }
 }
 
+/// What the parts by which two fits differ change in every row.
+fn change(without: &Fit, with: &Fit) -> Vec<Vec<f64>> {
+    let rows = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).map(|(a, b)| a - b).collect();
+    (without.innovations.iter().zip(&with.innovations))
+        .map(rows)
+        .collect()
+}
+
 /// Parts that rows which they were not fitted to do not speak for, or that one of the splits speaks against by [`THRESHOLDS`]' tie. Rows
-/// in which a part makes no difference (a clipping command that is small there) gain nothing and say nothing.
-fn unconfirmed(
-    ctx: &Context<'_>,
-    fit: &Fit,
-    splits: &[(Mask, Mask)],
-    threads: usize,
-) -> Vec<usize> {
-    if fit.parts.is_empty() {
-        return Vec::new();
-    }
-    let predicted = |all: &Fit| -> Vec<f64> {
-        let by = |(train, _): &(Mask, Mask)| surprise(all, &ctx.refit(all, train, ROUNDS));
-        splits.iter().map(by).collect()
-    };
-    let whole = predicted(fit);
+/// in which a part makes no difference (a clipping command that is small there) gain nothing and say nothing: what is split is the
+/// difference that the part makes.
+fn unconfirmed(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<usize> {
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
     let fails = cellpos_numeric::parallel::map(&indices, threads, |&i| {
         let mut parts = fit.parts.clone();
         parts.remove(i);
-        let without = predicted(&ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), ROUNDS));
-        let gains = without
-            .iter()
-            .zip(&whole)
-            .map(|(without, whole)| without - whole);
+        let without = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), ROUNDS);
+        let splits = splits_of(&change(&without, fit));
+        let gains = splits.iter().map(|(train, _)| {
+            let of = |all: &Fit| surprise(all, &ctx.refit(all, train, ROUNDS));
+            of(&without) - of(fit)
+        });
         let (sum, least) = gains.fold((0.0, f64::INFINITY), |(s, l): (f64, f64), g| {
             (s + g, l.min(g))
         });

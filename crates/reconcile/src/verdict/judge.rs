@@ -186,7 +186,7 @@ fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Opti
     }
     if e.names.curvature {
         return Some(format!(
-            "the best of the catalogue, {best}, needs a static curvature of the response more than the memory of a hysteresis: no name"
+            "the best of the catalogue, {best}, explains no more than a curve of the response without memory: no name"
         ));
     }
     if open && closed < THRESHOLDS.closed_least {

@@ -96,10 +96,28 @@ impl Searching<'_> {
             } else {
                 0.0
             };
-            if changes.abs() < 0.03 || changes > error {
+            if changes > error {
                 return Searched { found, problem };
             }
-            problem = problem.with_noise(refined);
+            let next = if changes.abs() >= 0.03 {
+                refined
+            } else if found.fit.parts.is_empty() {
+                // The size of the floor stands. How much of it is a walk, a short rest tells worse than the whole records.
+                let size = (1.0 + changes).powi(-2);
+                NoiseModel {
+                    walk_um2: size * refined.walk_um2,
+                    white_um2: size * refined.white_um2,
+                    ..refined
+                }
+            } else {
+                return Searched { found, problem };
+            };
+            if problem.unlikelihood(&noise, &residual) - problem.unlikelihood(&next, &residual)
+                < SETTLED
+            {
+                return Searched { found, problem };
+            }
+            problem = problem.with_noise(next);
             start = Some(found.fit);
         }
     }

@@ -30,6 +30,8 @@ pub(super) enum Hidden {
     Clip(f64, f64),
     /// Share of the stroke, by Dahl's equation, and the motion after which it has turned \[um\].
     Dahl(f64, f64),
+    /// Share of the stroke, in three play operators of 50 nm, 0.3 um and 1.5 um.
+    Plays(f64),
     /// Corner \[Hz\].
     Lag(f64),
     /// Frequency \[Hz\] and damping.
@@ -58,6 +60,8 @@ pub(super) enum Hidden {
     Play(f64),
     /// Cubic part \[1/um^2\].
     Stiffening(f64),
+    /// Part that goes with the square, of the sign of the displacement \[1/um\].
+    Progressive(f64),
     /// Frequency \[Hz\], damping and share of a stand that the piezo shakes.
     Shake(f64, f64, f64),
     /// Change of the gain \[1/s\].
@@ -77,6 +81,7 @@ impl Hidden {
             Self::Leak(w) => ("leak", vec![("corner_rad_per_s", w)]),
             Self::Clip(low, high) => ("saturation", vec![("low_um", low), ("high_um", high)]),
             Self::Dahl(share, _) => ("pzt-hysteresis", vec![("fraction", share)]),
+            Self::Plays(_) => ("pzt-hysteresis", vec![]),
             Self::Lag(hz) => ("driver-lag", vec![("bandwidth_hz", hz)]),
             Self::Resonance(hz, d) => ("pzt-resonance", vec![("frequency_hz", hz), ("damping", d)]),
             // `1 - s/(1 + T s)` is `(1 + (1 + k) T s)/(1 + T s)` over `1 + k`, where `1 - s` is `1/(1 + k)`.
@@ -95,6 +100,7 @@ impl Hidden {
             Self::Repeats(rate) => ("frame-repeats", vec![("rate", rate)]),
             Self::Play(width) => ("backlash", vec![("width_um", width)]),
             Self::Stiffening(c) => ("stiffening", vec![("per_um2", c)]),
+            Self::Progressive(c) => ("stiffening", vec![("per_um", c)]),
             Self::Shake(hz, d, share) => (
                 "camera-shake",
                 vec![("frequency_hz", hz), ("damping", d), ("share", share)],
@@ -145,6 +151,7 @@ impl Chain {
                 s[0]
             }
             Hidden::Stiffening(c) => u + c * u.powi(3),
+            Hidden::Progressive(c) => u + c * u * u.abs(),
             // The stand; what it adds to the picture is read from outside.
             Hidden::Shake(hz, damping, share) => {
                 s[2] = share * swung(s, u, TAU * hz, damping, h).1;
@@ -155,6 +162,16 @@ impl Chain {
             Hidden::Dahl(share, turn_um) => {
                 s[0] += moved / turn_um * (1.0 - moved.signum() * s[0]);
                 u - share * turn_um * s[0]
+            }
+            Hidden::Plays(share) => {
+                let each = s.iter_mut().zip([0.05, 0.3, 1.5]);
+                let lost: f64 = each
+                    .map(|(p, half)| {
+                        *p = p.clamp(u - half, u + half);
+                        u - *p
+                    })
+                    .sum();
+                u - share / 3.0 * lost
             }
             Hidden::Lag(hz) => lagged(&mut s[0], u, h * TAU * hz),
             Hidden::Resonance(hz, damping) => swung(s, u, TAU * hz, damping, h).0,

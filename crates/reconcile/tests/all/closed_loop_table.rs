@@ -8,12 +8,14 @@ use crate::closed_loop::{DELAY_S, Flow, Hidden, closed_loop, run_from, survey};
 use cellpos_numeric::Random;
 use cellpos_reconcile::{Options, Reconciliation, Record};
 
-const ROWS: [Hidden; 24] = [
+const ROWS: [Hidden; 27] = [
     Hidden::Nothing,
     Hidden::Leak(2.0),
     Hidden::Clip(19.4, 20.6),
+    Hidden::Clip(0.0, 20.65),
     Hidden::Gain(0.8),
     Hidden::Dahl(0.3, 0.2),
+    Hidden::Plays(0.3),
     Hidden::Lag(120.0),
     Hidden::Resonance(280.0, 0.1),
     Hidden::Relaxation(0.2, 0.3),
@@ -28,6 +30,7 @@ const ROWS: [Hidden; 24] = [
     Hidden::Repeats(0.05),
     Hidden::Play(0.1),
     Hidden::Stiffening(0.2),
+    Hidden::Progressive(0.4),
     Hidden::Shake(30.0, 0.1, 0.3),
     Hidden::GainDrift(-0.004),
     Hidden::Line(50.0, 0.1),
@@ -116,6 +119,27 @@ fn a_relaxation_that_one_part_of_the_record_leaves_open_is_named() {
         high - strength.value > 1.3 * (strength.value - low),
         "{strength:?}"
     );
+}
+
+#[test]
+fn a_clip_that_a_few_seconds_reach_is_named() {
+    // Beyond the last large stroke there is nothing to confirm it, and before the first one neither.
+    let clip = Hidden::Clip(0.0, 20.65);
+    assert!(row(clip, &look_for(clip, 431, 2)));
+}
+
+#[test]
+#[ignore = "14 s of a release build: for .ci/nightly"]
+fn a_hysteresis_that_is_a_gain_for_the_most_part_is_named() {
+    let plays = Hidden::Plays(0.3);
+    assert!(row(plays, &look_for(plays, 432, 2)));
+}
+
+#[test]
+#[ignore = "14 s of a release build: for .ci/nightly"]
+fn a_chip_that_stiffens_with_the_square_is_named() {
+    let progressive = Hidden::Progressive(0.4);
+    assert!(row(progressive, &look_for(progressive, 433, 2)));
 }
 
 #[test]

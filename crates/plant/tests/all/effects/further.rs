@@ -18,6 +18,20 @@ fn a_stiffening_makes_a_third_harmonic_of_a_quarter_of_c_a_squared() {
 }
 
 #[test]
+fn a_stiffening_by_the_square_makes_a_third_harmonic_of_c_a_squared() {
+    let (c, a, f) = (0.05, 1.5, 10.0);
+    let y = run(
+        &unity().with_effect(effects::stiffening_by_square(c)),
+        &sine(f, a, 1e-3, 3000),
+        1e-3,
+    );
+    // Fourier series of sin |sin|.
+    let third = harmonic(&y, 3.0 * f, 1e-3, 1000).norm();
+    let right = 8.0 / (15.0 * std::f64::consts::PI) * c * a * a;
+    assert!((third / right - 1.0).abs() < 1e-3, "{third} {right}");
+}
+
+#[test]
 fn a_swinging_gain_multiplies_the_speed_and_a_valve_adds_a_drift_in_proportion_to_it() {
     let ramp: Vec<f64> = (0..4000).map(|k| 1e-3 * f64::from(k)).collect();
     let (depth, period_s) = (0.2, 2.0);
