@@ -60,6 +60,9 @@ pub struct Thresholds {
     /// An addition smaller than [`Self::addition_share`] must gain this many times the usual least gain. Pinned by
     /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
     pub small_gain: f64,
+    /// A hysteresis gets no name if a curve without memory in front of the plant explains this share of what it explains beyond a gain. For
+    /// relays that share is 0.4 to 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
+    pub curve_share: f64,
     /// Rows of rest or of repeated command that give the noise to a few percent, and rows in all that can separate effects.
     pub floor_rows: usize,
     /// A command counts as at rest where its range is below this part of the range of all records: a measured input is
@@ -140,6 +143,7 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     companion_rest: 0.1,
     companion_untypical: 0.5,
     small_gain: 4.0,
+    curve_share: 0.95,
     floor_rows: 400,
     rest_share: 1e-3,
     repeat_share: 0.14,

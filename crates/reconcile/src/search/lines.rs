@@ -142,7 +142,7 @@ impl Spectra {
         // Fine enough for the highest multiple.
         let step_hz = self.step_hz / harmonics as f64;
         let (from, to) = ((hz.start / step_hz) as usize, (hz.end / step_hz) as usize);
-        let least = threshold_of_waves(to - from);
+        let least = threshold_of_waves(to.saturating_sub(from));
         let bin = |m: usize, times: usize| (times * m + harmonics / 2) / harmonics;
         let gain = |m: usize| -> f64 {
             let itself = self.whole.get(bin(m, 1)).copied().unwrap_or(0.0);
@@ -176,6 +176,9 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
     /// Slower ones a walk hides.
     const LOWEST_HZ: f64 = 3.0;
     let highest_hz = 0.48 / ctx.problem.base.sample_s;
+    if highest_hz <= LOWEST_HZ {
+        return None;
+    }
     let spectra = Spectra::of(ctx, fit, &ctx.problem.all(), highest_hz)?;
     spectra.strongest(1, LOWEST_HZ..highest_hz)
 }

@@ -10,7 +10,7 @@ use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::linear::Columns;
-use crate::search::cost::{gap, least_gain, penalised_cost, prior_penalty};
+use crate::search::cost::{gap, penalised_cost, prior_penalty, threshold};
 use crate::search::sequential::Found;
 use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
@@ -168,9 +168,8 @@ pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> f6
     gained_beside(ctx, fit, free)
 }
 
-/// Whether a part is a hysteresis whose memory is not worth having beside a curve without memory in front of the plant. `without` is the
-/// set without it, `gained` what it gains. The curve takes a gain up as well: what is left to the memory may be a small part of the
-/// whole, and yet beyond doubt.
+/// Whether a part is a hysteresis that some curve without memory in front of the plant explains as well. `without` is the set without it,
+/// `gained` what it gains. Of a gain nothing is said: a hysteresis makes one, however well its memory shows.
 pub(crate) fn remembers_nothing(
     ctx: &Context<'_>,
     part: &Part,
@@ -180,9 +179,11 @@ pub(crate) fn remembers_nothing(
     if !part.variant.remembers_turns() {
         return false;
     }
-    let curve = gained_beside(ctx, without, bends(ctx));
+    let by_a_gain = gained_beside(ctx, without, bends(ctx, &[0.0]));
+    let by_a_curve = gained_beside(ctx, without, bends(ctx, &KNOTS));
     let freedom = freedom_of(part.variant(), ctx.problem.records.len());
-    gained - curve < least_gain(freedom, curve)
+    gained - by_a_curve < threshold(freedom)
+        || by_a_curve - by_a_gain > THRESHOLDS.curve_share * (gained - by_a_gain)
 }
 
 /// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.
@@ -253,11 +254,11 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
     out
 }
 
-/// Places in the command's range, as shares of it, at which a curve may bend.
-const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
+/// Places in the command's range, as shares of it, at which a curve may bend; from the first on it is a gain.
+const KNOTS: [f64; 8] = [0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
 
-/// Innovations by record and column of a curve in front of the plant that bends at places of the command's range.
-fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
+/// Innovations by record and column of a curve in front of the plant that bends at these places of the command's range.
+fn bends(ctx: &Context<'_>, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
     let records = &ctx.problem.records;
     let (low, high) = records
         .iter()
@@ -268,7 +269,7 @@ fn bends(ctx: &Context<'_>) -> Vec<Vec<Vec<f64>>> {
     records
         .iter()
         .map(|r| {
-            KNOTS
+            knots
                 .iter()
                 .map(|knot| {
                     let at = low + knot * (high - low);
