@@ -180,7 +180,8 @@ pub(crate) fn remembers_nothing(
         return false;
     }
     let by_a_gain = gained_beside(ctx, without, bends(ctx, &[0.0]));
-    let by_a_curve = gained_beside(ctx, without, bends(ctx, &KNOTS));
+    let curve = [&[0.0], &KNOTS[..]].concat();
+    let by_a_curve = gained_beside(ctx, without, bends(ctx, &curve));
     let freedom = freedom_of(part.variant(), ctx.problem.records.len());
     gained - by_a_curve < threshold(freedom)
         || by_a_curve - by_a_gain > THRESHOLDS.curve_share * (gained - by_a_gain)
@@ -247,15 +248,15 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
         }
     }
     if curved {
-        for (out, bends) in out.iter_mut().zip(bends(ctx)) {
+        for (out, bends) in out.iter_mut().zip(bends(ctx, &KNOTS)) {
             out.extend(bends);
         }
     }
     out
 }
 
-/// Places in the command's range, as shares of it, at which a curve may bend; from the first on it is a gain.
-const KNOTS: [f64; 8] = [0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
+/// Places in the command's range, as shares of it, at which a curve may bend; one that bends where the range begins is a gain.
+const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
 
 /// Innovations by record and column of a curve in front of the plant that bends at these places of the command's range.
 fn bends(ctx: &Context<'_>, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
