@@ -177,9 +177,9 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         false
     }
 
-    /// Whether its output depends on where its input turned, as that of a hysteresis does.
-    fn remembers_turns(&self) -> bool {
-        false
+    /// The candidate with the static curve of the effect but no memory, if any.
+    fn memoryless(&self) -> Option<usize> {
+        None
     }
 
     /// Other candidates with the numbers of this one, in equations that few records tell from its own.

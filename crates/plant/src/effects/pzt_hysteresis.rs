@@ -171,6 +171,12 @@ const CANDIDATES: &[Candidate] = &[
         late: true,
         ..Candidate::chain(PLAY_NUMBERS.split_at(LEVELS.len() + 1).0)
     },
+    // Play operators without memory; never a start of the search.
+    Candidate {
+        name: "curvature",
+        late: true,
+        ..Candidate::chain(&[QUADRATIC, CUBIC])
+    },
     // For records of the piezo itself. Behind a chip, a cubic curve may come from a saturation or a spring, which are separate effects.
     Candidate {
         name: "curved play",
@@ -243,8 +249,8 @@ impl EffectKind for PztHysteresis {
         true
     }
 
-    fn remembers_turns(&self) -> bool {
-        true
+    fn memoryless(&self) -> Option<usize> {
+        CANDIDATES.iter().position(|c| c.name == "curvature")
     }
 
     fn has_unlike_forms(&self) -> bool {
@@ -257,7 +263,7 @@ impl EffectKind for PztHysteresis {
 
     fn starts(&self, index: usize, scope: &Scope) -> Vec<Vec<f64>> {
         match index {
-            0 | 4 => [0.3, 1.0, 3.0, 8.0]
+            0 | 5 => [0.3, 1.0, 3.0, 8.0]
                 .iter()
                 .flat_map(|b| [0.1, 0.35].map(|f| vec![f, (b / scope.stroke_um).min(40.0), 0.0]))
                 .collect(),
@@ -265,7 +271,7 @@ impl EffectKind for PztHysteresis {
                 .into_iter()
                 .map(|v| vec![v[0], v[1] * scope.stroke_um])
                 .collect(),
-            2 | 3 if index == 2 || scope.sampled_input => [0.02, 0.05]
+            2 | 4 if index == 2 || scope.sampled_input => [0.02, 0.05]
                 .iter()
                 .map(|wide| {
                     let mut start = vec![*wide; LEVELS.len()];
@@ -284,14 +290,23 @@ impl EffectKind for PztHysteresis {
         match index {
             0 => bouc_wen(at(0), at(1), at(2).clamp(-at(1), at(1))),
             1 => exponential_play(at(0), at(1)),
-            4 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
-            _ => curved_play(
+            5 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
+            2 | 4 => curved_play(
                 &thresholds,
                 &values[..LEVELS.len()],
                 Curve {
                     quadratic_per_um: at(LEVELS.len()),
                     cubic_per_um2: at(LEVELS.len() + 1),
                     input_quadratic_per_um: at(LEVELS.len() + 2),
+                },
+            ),
+            _ => curved_play(
+                &thresholds[..1],
+                &[1.0],
+                Curve {
+                    quadratic_per_um: at(0),
+                    cubic_per_um2: at(1),
+                    ..Curve::default()
                 },
             ),
         }

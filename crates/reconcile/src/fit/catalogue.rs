@@ -64,9 +64,10 @@ impl Variant {
         self.kind.is_gain()
     }
 
-    /// Whether its output depends on where its input turned, as that of a hysteresis does.
-    pub(crate) fn remembers_turns(self) -> bool {
-        self.kind.remembers_turns()
+    /// The form of the same effect that has its static curve and none of its memory.
+    pub(crate) fn memoryless(self) -> Option<Self> {
+        let form = self.kind.memoryless()?;
+        Some(Self { form, ..self })
     }
 
     /// Other forms with the same numbers, in equations that few records tell from this one's.

@@ -86,12 +86,10 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
 /// The set with the best rival in place of a hysteresis without memory, which explains no more than a static curve. A gain is such a
 /// curve.
 fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize) -> Option<Fit> {
-    if !found.fit.parts[i].variant.remembers_turns() {
-        return None;
-    }
+    found.fit.parts[i].variant.memoryless()?;
     let rivals = found.rivals.get(i)?.iter();
     let fits = rivals
-        .filter(|r| !r.is_limit && !r.part.variant.remembers_turns())
+        .filter(|r| !r.is_limit && r.part.variant.memoryless().is_none())
         .map(|r| {
             let mut parts = found.fit.parts.clone();
             parts[i] = r.part.clone();
@@ -176,15 +174,20 @@ pub(crate) fn remembers_nothing(
     without: &Fit,
     gained: f64,
 ) -> bool {
-    if !part.variant.remembers_turns() {
+    if part.variant.memoryless().is_none() {
         return false;
     }
-    let by_a_gain = gained_beside(ctx, without, bends(ctx, &[0.0]));
+    let by_a_gain = gained_by_a_gain(ctx, without);
     let curve = [&[0.0], &KNOTS[..]].concat();
     let by_a_curve = gained_beside(ctx, without, bends(ctx, &curve));
     let freedom = freedom_of(part.variant(), ctx.problem.records.len());
     gained - by_a_curve < threshold(freedom)
         || by_a_curve - by_a_gain > THRESHOLDS.curve_share * (gained - by_a_gain)
+}
+
+/// The gain in twice the log-likelihood by another gain of the plant.
+pub(crate) fn gained_by_a_gain(ctx: &Context<'_>, fit: &Fit) -> f64 {
+    gained_beside(ctx, fit, bends(ctx, &[0.0]))
 }
 
 /// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.

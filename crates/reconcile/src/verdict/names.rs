@@ -36,7 +36,7 @@ pub(crate) struct Names {
     pub effects: Vec<NamedEffect>,
     /// Whether other names explain the records as well.
     pub ambiguous: bool,
-    /// Whether a hysteresis explains no more than a curve without memory.
+    /// Whether a hysteresis explains by its static curvature more than by its memory.
     pub curvature: bool,
 }
 
@@ -138,7 +138,8 @@ pub(crate) fn names(
         parts.remove(i);
         let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
         let gain = (without.chi2 - fit.chi2).max(0.0);
-        out.curvature |= form::remembers_nothing(ctx, part, &without, gain);
+        out.curvature |= mostly_curvature(ctx, fit, i, &without)
+            || form::remembers_nothing(ctx, part, &without, gain);
         // A hysteresis that remembers nothing is the curve that it is, and no rival of another.
         let remembers =
             |r: &&Rival| !form::remembers_nothing(ctx, &r.part, &without, without.chi2 - r.chi2);
@@ -230,4 +231,29 @@ pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>)
         places.push(format!("{missing} of {} rows have no output", frames.rows));
     }
     (named, places)
+}
+
+/// Whether most of what play operators gain beyond a gain of the plant is their static curve, which is no hysteresis. `without` is the set
+/// without them.
+fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, without: &Fit) -> bool {
+    let part = &fit.parts[index];
+    if !part.variant().params.iter().any(|p| p.name == "weights") {
+        return false;
+    }
+    let Some(v) = part.variant.memoryless() else {
+        return false;
+    };
+    // Without memory the sum of the operators is the input.
+    let of = |word: &str| -> f64 {
+        let curves = part.variant().params.iter().zip(part.natural());
+        let alike = curves.filter(|(p, _)| p.name.ends_with(word));
+        alike.map(|(_, value)| value).sum()
+    };
+    let curve = v.candidate().params.iter().map(|p| of(p.name));
+    let mut parts = fit.parts.clone();
+    parts[index] = Part::new(v, &curve.collect::<Vec<_>>());
+    let forgetful = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 12);
+    // What memory adds must be at least a half of the whole.
+    let beyond = without.chi2 - fit.chi2 - form::gained_by_a_gain(ctx, without);
+    forgetful.chi2 - fit.chi2 < 0.5 * beyond
 }
