@@ -18,8 +18,8 @@ pub(crate) fn threshold(freedom: usize) -> f64 {
     THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, CHANCE_SD)
 }
 
-/// What a further response to the command must gain beside what explains `gained` already: beyond chance, and beyond the difference
-/// between the equations and nature's.
+/// Least gain of a further response to the command over a set that explains `gained`: beyond chance, and beyond the difference between
+/// the equations and nature's.
 pub(crate) fn least_gain(freedom: usize, gained: f64) -> f64 {
     threshold(freedom).max(THRESHOLDS.addition_share * gained)
 }

@@ -361,10 +361,10 @@ fn beside(library: &[Column], basis: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<V
         .collect()
 }
 
-/// What a formula must gain on rows that it has not seen, in twice the log-likelihood, beside a simpler one.
+/// Least gain of a formula over a simpler one on rows that it has not seen, in twice the log-likelihood.
 const UNSEEN: f64 = 10.0;
 
-/// A formula, and what it leaves of the innovations.
+/// A formula, and the innovations that are left.
 struct Selected {
     line: Option<Line>,
     /// Places in the library, with their coefficients.
@@ -372,8 +372,8 @@ struct Selected {
     left: Vec<Vec<f64>>,
 }
 
-/// The formula for what a fit leaves, with a line that has a separate amplitude and phase in every record if that says more. A response
-/// that is off makes lines of the command's sines as well, and its terms say as much.
+/// The formula for the innovations of a fit. A line with a separate amplitude and phase in every record is part of it if that says more: a
+/// response that is off makes lines of the command's sines, too, and its terms say as much.
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
     let (train, test) = split_in_time(&ctx.problem.records);
     let squares = |e: &[Vec<f64>]| inner(e, e, &test);

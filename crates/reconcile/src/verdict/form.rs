@@ -56,7 +56,8 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
             let part = &found.fit.parts[i];
             let gained = without[i].chi2 - found.fit.chi2;
             may_be_form(part)
-                && (remembers_nothing(ctx, part, &without[i], gained)
+                && (part.variant.memoryless().is_some()
+                    && WithoutMemory::beside(ctx, &without[i]).explains(part, gained)
                     || worth[i] < THRESHOLDS.companion_share
                         && is_form(ctx, &found.fit, i, &without[i], &worth))
         }) else {
@@ -64,7 +65,7 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         };
         // What is small is a form of the others.
         let is_large = worth[i] >= THRESHOLDS.companion_share;
-        if is_large && let Some(fit) = in_its_stead(ctx, found, i) {
+        if is_large && let Some(fit) = in_its_stead(ctx, found, i, &without[i]) {
             found.fit = fit;
             let taken = found.fit.parts[i].id();
             found.rivals[i].retain(|r| r.id != taken);
@@ -83,19 +84,23 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
     aside
 }
 
-/// The set with the best rival in place of a hysteresis without memory, which explains no more than a static curve. A gain is such a
+/// The set with a rival in place of a hysteresis without memory: one that explains as much as a static curve does. A gain is such a
 /// curve.
-fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize) -> Option<Fit> {
+fn in_its_stead(ctx: &Context<'_>, found: &Found, i: usize, without: &Fit) -> Option<Fit> {
     found.fit.parts[i].variant.memoryless()?;
+    let least = THRESHOLDS.curve_share * (without.chi2 - found.fit.chi2);
     let rivals = found.rivals.get(i)?.iter();
-    let fits = rivals
+    let mut fits: Vec<Fit> = rivals
         .filter(|r| !r.is_limit && r.part.variant.memoryless().is_none())
         .map(|r| {
             let mut parts = found.fit.parts.clone();
             parts[i] = r.part.clone();
             ctx.fit_from(parts, Some(found.fit.soft), &ctx.problem.all(), ROUNDS)
-        });
-    fits.min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
+        })
+        .filter(|fit| without.chi2 - fit.chi2 > least)
+        .collect();
+    fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
+    fits.into_iter().next()
 }
 
 /// Reduces a set to one effect if that effect alone, in a freer form, explains as much as the set. Within such a set no effect is
@@ -166,28 +171,36 @@ pub(crate) fn gain_of_freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> f6
     gained_beside(ctx, fit, free)
 }
 
-/// Whether a part is a hysteresis that some curve without memory in front of the plant explains as well. `without` is the set without it,
-/// `gained` what it gains. Of a gain nothing is said: a hysteresis makes one, however well its memory shows.
-pub(crate) fn remembers_nothing(
-    ctx: &Context<'_>,
-    part: &Part,
-    without: &Fit,
-    gained: f64,
-) -> bool {
-    if part.variant.memoryless().is_none() {
-        return false;
-    }
-    let by_a_gain = gained_by_a_gain(ctx, without);
-    let curve = [&[0.0], &KNOTS[..]].concat();
-    let by_a_curve = gained_beside(ctx, without, bends(ctx, &curve));
-    let freedom = freedom_of(part.variant(), ctx.problem.records.len());
-    gained - by_a_curve < threshold(freedom)
-        || by_a_curve - by_a_gain > THRESHOLDS.curve_share * (gained - by_a_gain)
+/// Gains in twice the log-likelihood over a set by what has no memory, in front of the plant.
+pub(crate) struct WithoutMemory {
+    by_a_gain: f64,
+    by_a_curve: f64,
+    records: usize,
 }
 
-/// The gain in twice the log-likelihood by another gain of the plant.
-pub(crate) fn gained_by_a_gain(ctx: &Context<'_>, fit: &Fit) -> f64 {
-    gained_beside(ctx, fit, bends(ctx, &[0.0]))
+impl WithoutMemory {
+    pub(crate) fn beside(ctx: &Context<'_>, set: &Fit) -> Self {
+        let by = |knots: &[f64]| gained_beside(ctx, set, bends(ctx, knots));
+        Self {
+            by_a_gain: by(&[0.0]),
+            by_a_curve: by(&[&[0.0], &KNOTS[..]].concat()),
+            records: ctx.problem.records.len(),
+        }
+    }
+
+    /// What is left of a gain in twice the log-likelihood beyond a gain of the plant.
+    pub(crate) fn beyond_a_gain(&self, gained: f64) -> f64 {
+        gained - self.by_a_gain
+    }
+
+    /// Whether some curve explains a hysteresis that gains so much as well. Of a gain nothing is said: a hysteresis makes
+    /// one, however well its memory shows.
+    pub(crate) fn explains(&self, part: &Part, gained: f64) -> bool {
+        let memory = gained - self.by_a_curve;
+        memory < threshold(freedom_of(part.variant(), self.records))
+            || self.beyond_a_gain(self.by_a_curve)
+                > THRESHOLDS.curve_share * self.beyond_a_gain(gained)
+    }
 }
 
 /// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.

@@ -6,7 +6,7 @@ use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
 use crate::search::sequential::Rival;
 use crate::thresholds::THRESHOLDS;
-use crate::verdict::form;
+use crate::verdict::form::WithoutMemory;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};
 use crate::verdict::profile;
 use crate::verdict::result::{Effect as NamedEffect, Interval};
@@ -14,6 +14,7 @@ use crate::verdict::shapes;
 use crate::verdict::significance;
 use crate::verdict::split;
 use cellpos_plant::effects;
+use std::cell::LazyCell;
 use std::collections::BTreeMap;
 
 /// Whether no record of command and bead position can tell two effects apart.
@@ -138,11 +139,14 @@ pub(crate) fn names(
         parts.remove(i);
         let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
         let gain = (without.chi2 - fit.chi2).max(0.0);
-        out.curvature |= mostly_curvature(ctx, fit, i, &without)
-            || form::remembers_nothing(ctx, part, &without, gain);
+        let no_memory = LazyCell::new(|| WithoutMemory::beside(ctx, &without));
+        let of_no_memory = |part: &Part, gained: f64| {
+            part.variant.memoryless().is_some() && no_memory.explains(part, gained)
+        };
+        out.curvature |= of_no_memory(part, gain)
+            || is_of_plays(part) && mostly_curvature(ctx, fit, i, no_memory.beyond_a_gain(gain));
         // A hysteresis that remembers nothing is the curve that it is, and no rival of another.
-        let remembers =
-            |r: &&Rival| !form::remembers_nothing(ctx, &r.part, &without, without.chi2 - r.chi2);
+        let remembers = |r: &&Rival| !of_no_memory(&r.part, without.chi2 - r.chi2);
         let rivals: Vec<Rival> = (rivals.get(i).into_iter().flatten())
             .filter(remembers)
             .cloned()
@@ -233,13 +237,13 @@ pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>)
     (named, places)
 }
 
-/// Whether most of what play operators gain beyond a gain of the plant is their static curve, which is no hysteresis. `without` is the set
-/// without them.
-fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, without: &Fit) -> bool {
+fn is_of_plays(part: &Part) -> bool {
+    part.variant().params.iter().any(|p| p.name == "weights")
+}
+
+/// Whether most of `beyond`, what play operators gain beyond a gain of the plant, is their static curve, which is no hysteresis.
+fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, beyond: f64) -> bool {
     let part = &fit.parts[index];
-    if !part.variant().params.iter().any(|p| p.name == "weights") {
-        return false;
-    }
     let Some(v) = part.variant.memoryless() else {
         return false;
     };
@@ -254,6 +258,5 @@ fn mostly_curvature(ctx: &Context<'_>, fit: &Fit, index: usize, without: &Fit) -
     parts[index] = Part::new(v, &curve.collect::<Vec<_>>());
     let forgetful = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), 12);
     // What memory adds must be at least a half of the whole.
-    let beyond = without.chi2 - fit.chi2 - form::gained_by_a_gain(ctx, without);
     forgetful.chi2 - fit.chi2 < 0.5 * beyond
 }
