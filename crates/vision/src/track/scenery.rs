@@ -32,6 +32,7 @@ pub(super) struct Scenery {
     cells: Cells,
     clean8: Vec<u8>,
     clean16: Vec<u16>,
+    /// Always there, but for the empty scenery that stands in while this one is used.
     level: Option<Level>,
 }
 
@@ -132,13 +133,11 @@ impl Scenery {
             *odd = if is_far { *odd + 1 } else { 0 };
             if *odd > LOOKS / 2 {
                 (*looks, *odd) = (0, 0);
+            } else if is_far {
+                continue;
             }
             *looks = (*looks + 1).min(MEMORY);
-            *mean += if is_far && *looks > 1 {
-                0.0
-            } else {
-                off / *looks as f32
-            };
+            *mean += off / *looks as f32;
         }
     }
 
