@@ -8,7 +8,9 @@ use crate::experiment::exciting::Handing;
 use crate::experiment::identify::held_bead::Setup;
 use crate::experiment::identify::led::{DelayTest, dithered_trips, switch};
 use crate::experiment::rows::{Rows, ended_spans, fix_noise_um};
-pub use crate::experiment::rows::{frame_age_ns, frames_passed_over, is_unseen};
+pub use crate::experiment::rows::{
+    frame_age_ns, frames_passed_over, is_unseen, repeat_before, repeats_picture,
+};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;
@@ -59,7 +61,8 @@ pub struct Acquired {
     pub age_s: Option<f64>,
     /// Localisation noise that vision reported, um RMS.
     pub fix_noise_um: Option<f64>,
-    /// The whole run since the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN without one.
+    /// The whole run since the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN without one. A
+    /// picture that came twice repeats the position before.
     pub rows: (Vec<f64>, Vec<f64>),
     /// Whether a row's frame came but showed no reliable bead.
     pub unseen: Vec<bool>,
@@ -379,9 +382,9 @@ impl OnRig {
             age_s: rows.age_s(),
             fix_noise_um: fix_noise_um(ticks),
             frame_age_s: rows.frame_age_s(),
-            late_command: rows.stalled,
-            rows: (rows.input, rows.output),
-            unseen: rows.unseen,
+            late_command: rows.stalled.clone(),
+            unseen: rows.unseen.clone(),
+            rows: rows.delivered(),
             out_of_view,
             trouble: None,
             run: None,

@@ -6,6 +6,7 @@ use crate::experiment::lateness::{
 };
 use cellpos_ident::experiment::{RecordedSegment, Span};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
+use cellpos_vision::Decision;
 
 /// Localisation noise that vision reported in these ticks, um RMS.
 pub(crate) fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
@@ -23,6 +24,18 @@ pub(crate) fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
 pub fn is_unseen(tick: &TickRecord) -> bool {
     let came = tick.verdict != 255 && !tick.flags.has(TickFlags::TIMER);
     came && !tick.measured_um.is_finite()
+}
+
+/// Whether a tick's frame was new by its id and its stamp and showed, pixel by pixel, the picture before it: the camera delivered one twice.
+pub fn repeats_picture(tick: &TickRecord) -> bool {
+    is_unseen(tick) && is_new_frame(tick) && tick.decision == Decision::Stale as u8
+}
+
+/// The position before, for a row whose frame repeats it. So a record shows what the camera delivered, and its repeats can be counted.
+pub fn repeat_before(bead_um: &mut [f64], row: usize) {
+    if row > 0 && row < bead_um.len() {
+        bead_um[row] = bead_um[row - 1];
+    }
 }
 
 /// Frames that arrived together with a tick's frame and were not used: late, for example after a stall of the camera, but not dropped.
@@ -59,6 +72,8 @@ pub(crate) struct Rows {
     pub(crate) unseen: Vec<bool>,
     /// The frame came in time and showed no reliable bead.
     without_bead: Vec<bool>,
+    /// The frame came in time and repeats the picture before it.
+    repeated: Vec<bool>,
     /// Age that each row's frame has if its command is on time, ns; `None` if it was not.
     ages_ns: Vec<Option<i64>>,
     /// Usual age of a frame at its tick, in rows.
@@ -95,6 +110,7 @@ impl Rows {
             stalled: Vec::new(),
             unseen: Vec::new(),
             without_bead: Vec::new(),
+            repeated: Vec::new(),
             ages_ns: Vec::new(),
             usual_age_periods: 0.0,
             of_tick: Vec::new(),
@@ -133,6 +149,7 @@ impl Rows {
                 rows.stalled.push(true);
                 rows.unseen.push(false);
                 rows.without_bead.push(false);
+                rows.repeated.push(false);
                 rows.ages_ns.push(None);
             }
             let age_ns = age_ns(tick);
@@ -155,6 +172,7 @@ impl Rows {
             }
             rows.unseen[row] = is_unseen(tick) || new_frame && !on_time;
             rows.without_bead[row] = is_unseen(tick);
+            rows.repeated[row] = repeats_picture(tick) && on_time;
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
             rows.usable[row] = tick.is_controlled();
             // If a tick was skipped or its record was lost, the next tick takes its place.
@@ -170,6 +188,15 @@ impl Rows {
             rows.usual_age_periods,
         );
         rows
+    }
+
+    /// Commands and positions as the camera delivered them, um.
+    pub(crate) fn delivered(self) -> (Vec<f64>, Vec<f64>) {
+        let mut bead_um = self.output;
+        for row in (0..bead_um.len()).filter(|row| self.repeated[*row]) {
+            repeat_before(&mut bead_um, row);
+        }
+        (self.input, bead_um)
     }
 
     /// Mean time from the middle of an exposure to its tick, s; `None` if no frame came in time.

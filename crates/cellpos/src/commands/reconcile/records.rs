@@ -8,7 +8,9 @@ use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
 use cellpos_session::sessions;
 use cellpos_workbench::experiment::collect::{neutral_um, record_name, refused};
-use cellpos_workbench::experiment::on_rig::{frame_age_ns, frames_passed_over, is_unseen};
+use cellpos_workbench::experiment::on_rig::{
+    frame_age_ns, frames_passed_over, is_unseen, repeat_before, repeats_picture,
+};
 use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -163,6 +165,9 @@ pub(super) fn read_run(path: &Path, run: &RunReader) -> Result<(Record, Option<f
             row.saturating_sub(frames_passed_over(&tick))..row + usize::from(is_unseen(&tick));
         if let Some(unseen) = read.unseen.get_mut(came) {
             unseen.fill(true);
+        }
+        if repeats_picture(&tick) {
+            repeat_before(&mut read.bead_um, row);
         }
         if let Some(age_ns) = frame_age_ns(&tick)
             && let Some(age_s) = read.frame_age_s.get_mut(row)
