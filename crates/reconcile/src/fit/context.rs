@@ -253,6 +253,14 @@ impl Context<'_> {
         self.problem.spend(work);
     }
 
+    /// What the model with its own effects answers to another input of a record.
+    pub(crate) fn response(&self, record: &Prepared, input_um: &[f64]) -> Vec<f64> {
+        let mut y = Vec::new();
+        let input = Input::new(input_um, &record.sampling);
+        simulate(&self.problem.base, input, &self.fixed, &mut y, None);
+        y
+    }
+
     /// Simulated positions of the records that count under a mask; empty for the others.
     pub(crate) fn simulated(&self, parts: &[Part], offset_um: f64, mask: &Mask) -> Vec<Vec<f64>> {
         let effects = self.effects(parts);

@@ -6,7 +6,6 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::{Mask, split_in_time};
 use crate::search::lines::{Line, strongest_line, without_line};
-use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
 use crate::units::Side;
 use nalgebra::{DMatrix, DVector};
@@ -216,15 +215,7 @@ pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
                 .map(|(r, rows)| {
                     let raw: Vec<f64> = rows.iter().map(formula).collect();
                     let moved = if place == "input" {
-                        let mut y = Vec::new();
-                        simulate(
-                            &ctx.problem.base,
-                            Input::new(&raw, &r.sampling),
-                            &[],
-                            &mut y,
-                            None,
-                        );
-                        y
+                        ctx.response(r, &raw)
                     } else {
                         // A loop has set a row's command by its position: what shows at the output is that of the row before.
                         let shown = rows.windows(2).map(|w| {
@@ -312,18 +303,8 @@ fn straight(ctx: &Context<'_>, library: &[Column], mask: &Mask) -> Vec<Vec<Vec<f
     if !ctx.problem.base.free_start {
         return Vec::new();
     }
-    let gain = ctx.problem.records.iter().map(|r| {
-        let (mut y, mut w) = (Vec::new(), vec![0.0; r.u.len()]);
-        simulate(
-            &ctx.problem.base,
-            Input::new(&r.u, &r.sampling),
-            &[],
-            &mut y,
-            None,
-        );
-        r.whiten(&y, &mut w);
-        w
-    });
+    let records = ctx.problem.records.iter();
+    let gain = records.map(|r| r.whitened(&ctx.response(r, &r.u)));
     let of_base = library
         .iter()
         .filter(|c| c.place == "input" && matches!(c.name, "y" | "v"))

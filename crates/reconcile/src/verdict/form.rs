@@ -12,7 +12,6 @@ use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::linear::Columns;
 use crate::search::cost::{gap, penalised_cost, prior_penalty, threshold};
 use crate::search::sequential::Found;
-use crate::simulate::{Input, simulate};
 use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
@@ -291,15 +290,7 @@ fn bends(ctx: &Context<'_>, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
                 .map(|knot| {
                     let at = low + knot * (high - low);
                     let bent: Vec<f64> = r.u.iter().map(|u| (u - at).max(0.0)).collect();
-                    let mut y = Vec::new();
-                    simulate(
-                        &ctx.problem.base,
-                        Input::new(&bent, &r.sampling),
-                        &[],
-                        &mut y,
-                        None,
-                    );
-                    r.whitened(&y)
+                    r.whitened(&ctx.response(r, &bent))
                 })
                 .collect()
         })
