@@ -1,7 +1,7 @@
 //! A rig in a closed loop whose zero flow moves, simulated apart from the catalogue: Eq. (6) by Euler steps of 50 us.
 
 use cellpos_numeric::Random;
-use cellpos_plant::{Model, Noise};
+use cellpos_plant::{Effect, Model, Noise};
 use cellpos_reconcile::{Options, Reconciliation, Record, reconcile};
 use std::f64::consts::TAU;
 
@@ -374,12 +374,19 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
 }
 
 pub(super) fn run(record: Record) -> Reconciliation {
-    run_from(record, WORKING_POINT_UM, &Options::default())
+    run_from(record, WORKING_POINT_UM, &Options::default(), Vec::new())
 }
 
 /// With another working point of the model.
-pub(super) fn run_from(record: Record, working_point_um: f64, options: &Options) -> Reconciliation {
+/// Beside a model that states some effects.
+pub(super) fn run_from(
+    record: Record,
+    working_point_um: f64,
+    options: &Options,
+    effects: Vec<Effect>,
+) -> Reconciliation {
     let model = Model {
+        effects,
         working_point_um,
         noise: Noise {
             diffusion_um2_per_s: 0.33,
