@@ -160,6 +160,9 @@ pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
         }
 }
 
+/// Step of a tangent, as a share of the stroke: a curve is straight over it, and rounding is a millionth of it.
+const SMALL: f64 = 1e-3;
+
 impl Context<'_> {
     /// Mean amplitude of a line at `times` its frequency, over the rows of the records \[um\].
     pub(crate) fn mean_wave_um(&self, line: &[Vec<[f64; 2]>], times: usize) -> f64 {
@@ -235,29 +238,58 @@ impl Context<'_> {
         y: &mut Vec<f64>,
         edge: Option<&mut Vec<f64>>,
     ) {
+        self.simulate_input((record, &record.u), effects, offset_um, y, edge);
+    }
+
+    /// The same with another input in place of the record's.
+    fn simulate_input(
+        &self,
+        (record, u): (&Prepared, &[f64]),
+        effects: &[Effect],
+        offset_um: f64,
+        y: &mut Vec<f64>,
+        edge: Option<&mut Vec<f64>>,
+    ) {
         let base = &self.problem.base;
         let input = |u| Input {
             flow_um: &record.flow_um,
             ..Input::new(u, &record.sampling)
         };
         let work = if offset_um == 0.0 {
-            simulate(base, input(&record.u), effects, y, edge)
+            simulate(base, input(u), effects, y, edge)
         } else {
             let base = Base {
                 working_point_um: base.working_point_um + offset_um,
                 ..base.clone()
             };
-            let u: Vec<f64> = record.u.iter().map(|u| u - offset_um).collect();
+            let u: Vec<f64> = u.iter().map(|u| u - offset_um).collect();
             simulate(&base, input(&u), effects, y, edge)
         };
         self.problem.spend(work);
     }
 
-    /// What the model with its own effects answers to another input of a record.
-    pub(crate) fn response(&self, record: &Prepared, input_um: &[f64]) -> Vec<f64> {
+    /// What a small addition to a record's command adds to its simulated position, per unit of the addition: the chain's tangent,
+    /// with the delay and everything else that the set of a fit has in it. `sim` is the record as it is.
+    pub(crate) fn response(
+        &self,
+        fit: &Fit,
+        (record, sim): (&Prepared, &[f64]),
+        added_um: &[f64],
+    ) -> Vec<f64> {
+        let most = added_um.iter().fold(0.0, |most: f64, a| most.max(a.abs()));
+        if most == 0.0 {
+            return vec![0.0; added_um.len()];
+        }
+        let step = SMALL * self.scope.stroke_um / most;
+        let u: Vec<f64> = (record.u.iter().zip(added_um))
+            .map(|(u, a)| u + step * a)
+            .collect();
         let mut y = Vec::new();
-        let input = Input::new(input_um, &record.sampling);
-        simulate(&self.problem.base, input, &self.fixed, &mut y, None);
+        let effects = self.effects(&fit.parts);
+        self.simulate_input((record, &u), &effects, fit.offset_um, &mut y, None);
+        for (y, sim) in y.iter_mut().zip(sim) {
+            *y = (*y - sim) / step;
+        }
         y
     }
 

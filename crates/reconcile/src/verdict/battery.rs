@@ -201,21 +201,23 @@ fn rows(ctx: &Context<'_>, i: usize, sim: &[f64], residual: &[f64]) -> Vec<Row> 
 
 /// The library about a fit.
 pub(crate) fn library(ctx: &Context<'_>, fit: &Fit) -> Vec<Column> {
-    let (residual, sim) = ctx.residual(fit);
+    let (residual, path) = ctx.residual(fit);
+    let sim = ctx.simulated(&fit.parts, fit.offset_um, &ctx.problem.all());
     let records = &ctx.problem.records;
     let rows: Vec<Vec<Row>> = (0..records.len())
-        .map(|i| rows(ctx, i, &sim[i], &residual[i]))
+        .map(|i| rows(ctx, i, &path[i], &residual[i]))
         .collect();
     let mut all = Vec::new();
     for &(name, powers, says, formula) in TERMS {
         for place in ["input", "output"] {
             let innovations = records
                 .iter()
+                .zip(&sim)
                 .zip(&rows)
-                .map(|(r, rows)| {
+                .map(|((r, sim), rows)| {
                     let raw: Vec<f64> = rows.iter().map(formula).collect();
                     let moved = if place == "input" {
-                        ctx.response(r, &raw)
+                        ctx.response(fit, (r, sim), &raw)
                     } else {
                         // A loop has set a row's command by its position: what shows at the output is that of the row before.
                         let shown = rows.windows(2).map(|w| {
@@ -299,12 +301,13 @@ fn term_of(ctx: &Context<'_>, column: &Column, value: f64) -> Term {
 const LEAST_OWN: f64 = 1e-4;
 
 /// What a change of gain, stiffness and damping of another plant's base would make, orthonormal on the rows of a mask.
-fn straight(ctx: &Context<'_>, library: &[Column], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
+fn straight(ctx: &Context<'_>, fit: &Fit, library: &[Column], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
     if !ctx.problem.base.free_start {
         return Vec::new();
     }
-    let records = ctx.problem.records.iter();
-    let gain = records.map(|r| r.whitened(&ctx.response(r, &r.u)));
+    let sim = ctx.simulated(&fit.parts, fit.offset_um, &ctx.problem.all());
+    let records = ctx.problem.records.iter().zip(&sim);
+    let gain = records.map(|(r, sim)| r.whitened(&ctx.response(fit, (r, sim), &r.u)));
     let of_base = library
         .iter()
         .filter(|c| c.place == "input" && matches!(c.name, "y" | "v"))
@@ -405,7 +408,7 @@ fn selected(
     let (train, test) = split_in_time(&ctx.problem.records);
     let e = line.as_ref().map_or(&fit.innovations, |l| &l.left);
     // A base that was fitted to records of a plant that bends has another gain and lag than the plant: what these change is no term.
-    let straight = straight(ctx, library, &train);
+    let straight = straight(ctx, fit, library, &train);
     let (columns, e) = (
         beside(library, &straight, &train),
         without(e, &straight, &train),

@@ -179,7 +179,7 @@ pub(crate) struct WithoutMemory {
 
 impl WithoutMemory {
     pub(crate) fn beside(ctx: &Context<'_>, set: &Fit) -> Self {
-        let by = |knots: &[f64]| gained_beside(ctx, set, bends(ctx, knots));
+        let by = |knots: &[f64]| gained_beside(ctx, set, bends(ctx, set, knots));
         Self {
             by_a_gain: by(&[0.0]),
             by_a_curve: by(&[&[0.0], &KNOTS[..]].concat()),
@@ -263,7 +263,7 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
         }
     }
     if curved {
-        for (out, bends) in out.iter_mut().zip(bends(ctx, &KNOTS)) {
+        for (out, bends) in out.iter_mut().zip(bends(ctx, fit, &KNOTS)) {
             out.extend(bends);
         }
     }
@@ -273,9 +273,10 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
 /// Places in the command's range, as shares of it, at which a curve may bend; one that bends where the range begins is a gain.
 const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
 
-/// Innovations by record and column of a curve in front of the plant that bends at these places of the command's range.
-fn bends(ctx: &Context<'_>, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
+/// Innovations by record and column of a curve in front of a set that bends at these places of the command's range.
+fn bends(ctx: &Context<'_>, fit: &Fit, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
     let records = &ctx.problem.records;
+    let sim = ctx.simulated(&fit.parts, fit.offset_um, &ctx.problem.all());
     let (low, high) = records
         .iter()
         .flat_map(|r| &r.u)
@@ -284,13 +285,14 @@ fn bends(ctx: &Context<'_>, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
         });
     records
         .iter()
-        .map(|r| {
+        .zip(&sim)
+        .map(|(r, sim)| {
             knots
                 .iter()
                 .map(|knot| {
                     let at = low + knot * (high - low);
                     let bent: Vec<f64> = r.u.iter().map(|u| (u - at).max(0.0)).collect();
-                    r.whitened(&ctx.response(r, &bent))
+                    r.whitened(&ctx.response(fit, (r, sim), &bent))
                 })
                 .collect()
         })
