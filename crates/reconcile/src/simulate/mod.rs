@@ -17,6 +17,7 @@ pub(crate) use cellpos_plant::{Effect, Place, Zpk};
 pub(crate) use input::Input;
 use input::slew;
 use modal::{Modal, Trace, has_fast_pole};
+use std::cell::Cell;
 
 /// The plant and the sampling that all records of a problem share.
 #[derive(Debug, Clone)]
@@ -94,6 +95,19 @@ const MOST_BEFORE: f64 = 50_000.0;
 /// Work of a step that every chain has, and of a block that is not linear, in advances of one mode.
 const WORK_OF_STEP: usize = 8;
 const WORK_OF_BLOCK: usize = 10;
+
+/// What a simulation writes its steps to: what enters the plant, and the motion.
+#[derive(Default)]
+struct Room {
+    x: Vec<f64>,
+    t: Trace,
+}
+
+thread_local! {
+    /// Kept from one simulation of a thread to the next. A minute of record on a fine grid has twenty megabytes of steps, and fresh
+    /// memory costs as much as the steps themselves.
+    static KEPT: Cell<Room> = Cell::default();
+}
 
 /// What happens to the signal before the plant, in order.
 enum Stage {
@@ -258,7 +272,8 @@ impl<'a> Chain<'a> {
     fn run_linear(&mut self, u: &[f64], y: &mut Vec<f64>, edge: Option<&mut Vec<f64>>) {
         let n = u.len();
         let h = self.base.sample_s / self.fine as f64;
-        let (mut x, pending) = self.ahead_of_plant(u, h);
+        let Room { x, mut t } = KEPT.take();
+        let (mut x, pending) = self.ahead_of_plant(u, h, x);
         if self.base.interpolated_input && self.base.zpk.zeros.len() < self.base.zpk.poles.len() {
             means(&mut x);
         }
@@ -279,13 +294,14 @@ impl<'a> Chain<'a> {
             }
             y.clear();
             y.extend(pos.into_iter().step_by(self.fine));
+            KEPT.set(Room { x, t });
             return;
         }
         if self.only_late() {
             self.run_late(modal, &x, h, y);
+            KEPT.set(Room { x, t });
             return;
         }
-        let mut t = Trace::default();
         modal.trace(&x, self.fine, &mut t);
         if self.base.interpolated_input {
             t.smooth(h);
@@ -295,6 +311,7 @@ impl<'a> Chain<'a> {
         self.behind_plant(&mut t, &x, &pending, h);
         t.add(&carried, -1.0);
         camera::sample(&t, (f, self.sampling), h, self.fine, n, y);
+        KEPT.set(Room { x, t });
     }
 
     /// Whether the bead is also carried by a flow next to the displacement, through a plant on whose motion blocks act.
@@ -346,16 +363,16 @@ impl<'a> Chain<'a> {
     }
 
     /// What enters the plant, step by step, without the linear blocks that come last before it.
-    fn ahead_of_plant(&mut self, u: &[f64], h: f64) -> (Vec<f64>, Zpk) {
-        let mut x: Vec<f64> = if self.base.interpolated_input {
-            between(u, self.fine)
-        } else if self.fine == 1 {
-            u.to_vec()
+    fn ahead_of_plant(&mut self, u: &[f64], h: f64, mut x: Vec<f64>) -> (Vec<f64>, Zpk) {
+        if self.base.interpolated_input {
+            x = between(u, self.fine);
         } else {
-            u.iter()
-                .flat_map(|&v| std::iter::repeat_n(v, self.fine))
-                .collect()
-        };
+            x.clear();
+            x.reserve(u.len() * self.fine);
+            for &v in u {
+                x.extend(std::iter::repeat_n(v, self.fine));
+            }
+        }
         let mut pending = Zpk::one();
         for stage in std::mem::take(&mut self.before) {
             match stage {
@@ -386,7 +403,7 @@ impl<'a> Chain<'a> {
         self.fine = self.fine.max(steps.clamp(1.0, MOST_STEPS) as usize);
         let n = u.len();
         let h = self.base.sample_s / self.fine as f64;
-        let (mut x, pending) = self.ahead_of_plant(u, h);
+        let (mut x, pending) = self.ahead_of_plant(u, h, Vec::new());
         if !pending.poles.is_empty() {
             x = Modal::new(&pending, h).means(&x);
         } else if pending.gain != 1.0 {
