@@ -196,7 +196,8 @@ impl Retuning {
             let [longer, shorter] = found.delay_odds(DELAYS[member], HALF_STEP);
             longer.max(shorter) > sure
         };
-        let delay = surely_not(before.member, REPORT_SURE) && !surely_not(self.member, DELAY_SURE);
+        // The delay in force is the likeliest: on the way to a longer one, one in between is not reported.
+        let delay = surely_not(before.member, REPORT_SURE) && !surely_not(self.member, 0.0);
         if !(gain || delay) {
             return None;
         }

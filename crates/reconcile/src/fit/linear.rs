@@ -22,6 +22,8 @@ pub(crate) struct Gain {
     pub score: f64,
     /// That scale.
     pub scale: f64,
+    /// What the direction itself adds to the sum of squares, beside what the tangents take over.
+    pub own: f64,
 }
 
 impl Tangents {
@@ -47,11 +49,13 @@ impl Tangents {
             return Gain {
                 score: 0.0,
                 scale: 0.0,
+                own: 0.0,
             };
         }
         Gain {
             score: de2 * de2 / dd2,
             scale: -de2 / dd2,
+            own: dd2,
         }
     }
 }

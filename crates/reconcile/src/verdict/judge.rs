@@ -9,6 +9,7 @@ use crate::units::figure;
 use crate::verdict::battery::{self, Column, Hypothesis};
 use crate::verdict::form::Aside;
 use crate::verdict::held_out::HeldOut;
+use crate::verdict::hidden;
 use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::names::Names;
 use crate::verdict::parameters;
@@ -96,6 +97,9 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
                 .push("no effect of the catalogue explains it".to_owned());
         } else if e.counted {
             out.verdict = Verdict::Named;
+        }
+        if out.verdict == Verdict::NothingMissing && e.floor.source.is_known() {
+            out.reasons.extend(hidden::sentence(ctx, e.fit, threads));
         }
         if out.verdict == Verdict::Unknown {
             describe(ctx, e.fit, &library, term, &mut out);

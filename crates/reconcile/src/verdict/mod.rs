@@ -6,6 +6,7 @@ pub(crate) mod battery;
 mod form;
 pub(crate) mod guard;
 mod held_out;
+mod hidden;
 pub(crate) mod judge;
 pub(crate) mod map;
 mod names;

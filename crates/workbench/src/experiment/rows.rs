@@ -26,9 +26,9 @@ pub fn is_unseen(tick: &TickRecord) -> bool {
     came && !tick.measured_um.is_finite()
 }
 
-/// Whether a tick's frame was new by its id and its stamp and showed, pixel by pixel, the picture before it: the camera delivered one twice.
+/// Whether a tick's frame, new by its id, shows the picture before it, pixel by pixel: the camera delivered one twice.
 pub fn repeats_picture(tick: &TickRecord) -> bool {
-    is_unseen(tick) && is_new_frame(tick) && tick.decision == Decision::Stale as u8
+    is_unseen(tick) && tick.decision == Decision::Stale as u8
 }
 
 /// The position before, for a row whose frame repeats it. So a record shows what the camera delivered, and its repeats can be counted.
@@ -72,7 +72,7 @@ pub(crate) struct Rows {
     pub(crate) unseen: Vec<bool>,
     /// The frame came in time and showed no reliable bead.
     without_bead: Vec<bool>,
-    /// The frame came in time and repeats the picture before it.
+    /// The frame repeats the picture before it.
     repeated: Vec<bool>,
     /// Age that each row's frame has if its command is on time, ns; `None` if it was not.
     ages_ns: Vec<Option<i64>>,
@@ -172,7 +172,7 @@ impl Rows {
             }
             rows.unseen[row] = is_unseen(tick) || new_frame && !on_time;
             rows.without_bead[row] = is_unseen(tick);
-            rows.repeated[row] = repeats_picture(tick) && on_time;
+            rows.repeated[row] = repeats_picture(tick);
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
             rows.usable[row] = tick.is_controlled();
             // If a tick was skipped or its record was lost, the next tick takes its place.

@@ -7,6 +7,7 @@ use cellpos_ident::experiment::{Plan, PlannedSegment};
 use cellpos_ident::frequency_response::Settings;
 use cellpos_ident::sampled::{Hold, Sampling};
 use cellpos_runtime::life::Life;
+use cellpos_vision::FixQuality;
 use std::f64::consts::TAU;
 
 const PERIOD_NS: i64 = 1_000_000;
@@ -255,6 +256,25 @@ fn frames_that_a_stall_kept_back_are_late_and_not_dropped() {
         (0..200).filter(|&k| missing(k)).collect::<Vec<_>>(),
         [dropped]
     );
+}
+
+#[test]
+fn a_picture_that_came_twice_repeats_its_position_for_who_counts_faults_of_the_camera_only() {
+    let mut ticks = ticks(10.0, 200, &CALM);
+    let twice = [50, 51, 120];
+    for k in twice {
+        let tick = &mut ticks[k];
+        tick.flags.set(TickFlags::STALE);
+        tick.verdict = FixQuality::NoSignal as u8;
+        tick.decision = Decision::Stale as u8;
+        tick.measured_um = f64::NAN;
+    }
+    let rows = Rows::of(&ticks, PERIOD_NS);
+    // No measurement: the bead has moved on.
+    assert!(twice.iter().all(|&k| rows.output[k].is_nan()));
+    let (_, delivered_um) = rows.delivered();
+    let repeats = (1..200).filter(|&k| delivered_um[k] == delivered_um[k - 1]);
+    assert_eq!(repeats.collect::<Vec<_>>(), twice);
 }
 
 #[test]
