@@ -9,7 +9,7 @@ use crate::units::figure;
 use cellpos_numeric::parallel;
 use cellpos_plant::effects::Role;
 
-/// Standard deviations beyond the least gain of a name: an effect of the size that is stated gets one in 98 of 100 records.
+/// Standard deviations beyond the least gain of a name: an effect of the stated size shows in 98 of 100 records.
 const SURELY: f64 = 2.0;
 
 /// A fit, with all that does not depend on what is added to it.
@@ -94,7 +94,7 @@ impl Seen<'_> {
         sizes
     }
 
-    /// The size from which on a part surely gets a name next to the noise of the records; its response is proportional to its size.
+    /// The size from which on a part surely shows next to the noise of the records; its response is proportional to its size.
     fn least_shown(&self, part: &Part, at: usize) -> Size {
         let candidate = part.variant();
         let values = part.natural();
