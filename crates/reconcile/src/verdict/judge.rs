@@ -78,32 +78,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     };
     if e.fit.parts.is_empty() {
         let beyond = left > CHANCE_SD * scatter || e.null_flagged || term.is_some();
-        if !e.floor.source.is_known() && beyond {
-            out.verdict = Verdict::Unknown;
-            out.reasons
-                .push(no_floor(ctx, e, "nothing of the catalogue helps"));
-        } else if !e.floor.source.is_known() {
-            out.reasons.push(
-                "nothing says how large the noise is (no rest, no repeated command, no stated noise), but what is left does not follow the command"
-                    .to_owned(),
-            );
-        } else if beyond && e.counted {
-            // Missing frames are counted, whatever the rest is.
-            out.verdict = Verdict::NamedWithRemainder;
-            out.remainder = Some(remainder(ctx, e, &library, term, 1.0));
-        } else if beyond {
-            out.verdict = Verdict::Unknown;
-            out.reasons
-                .push("no effect of the catalogue explains it".to_owned());
-        } else if e.counted {
-            out.verdict = Verdict::Named;
-        }
-        if out.verdict == Verdict::NothingMissing && e.floor.source.is_known() {
-            out.reasons.extend(hidden::sentence(ctx, e.fit, threads));
-        }
-        if out.verdict == Verdict::Unknown {
-            describe(ctx, e.fit, &library, term, &mut out);
-        }
+        without_effects(ctx, e, (&library, term), beyond, threads, &mut out);
         return out;
     }
     // Numbers of an equation that is off in its form differ a little from record to record; with the companions they must not.
@@ -156,6 +131,42 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         out.remainder = Some(left);
     }
     out
+}
+
+/// Where no effect was found: whether something is missing all the same, `beyond` chance.
+fn without_effects(
+    ctx: &Context<'_>,
+    e: &Evidence<'_>,
+    (library, term): (&[Column], Option<(usize, f64)>),
+    beyond: bool,
+    threads: usize,
+    out: &mut Judgement,
+) {
+    if !e.floor.source.is_known() && beyond {
+        out.verdict = Verdict::Unknown;
+        out.reasons
+            .push(no_floor(ctx, e, "nothing of the catalogue helps"));
+    } else if !e.floor.source.is_known() {
+        out.reasons.push(
+            "nothing says how large the noise is (no rest, no repeated command, no stated noise), but what is left does not follow the command"
+                .to_owned(),
+        );
+    } else if beyond && e.counted {
+        // Missing frames are counted, whatever the rest is.
+        out.verdict = Verdict::NamedWithRemainder;
+        out.remainder = Some(remainder(ctx, e, library, term, 1.0));
+    } else if beyond {
+        out.verdict = Verdict::Unknown;
+        out.reasons
+            .push("no effect of the catalogue explains it".to_owned());
+    } else if e.counted {
+        out.verdict = Verdict::Named;
+    } else {
+        out.reasons.extend(hidden::sentence(ctx, e.fit, threads));
+    }
+    if out.verdict == Verdict::Unknown {
+        describe(ctx, e.fit, library, term, out);
+    }
 }
 
 /// That a set is no name, and why.

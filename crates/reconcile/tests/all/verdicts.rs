@@ -152,8 +152,7 @@ fn an_effect_of_the_size_that_may_hide_shows_and_a_third_of_it_does_not() {
     let quiet = look(&Model::eq6());
     assert_eq!(quiet.verdict, Verdict::NothingMissing, "{:?}", quiet.places);
     let said = quiet.places.iter().find(|p| p.contains("need not show"));
-    let told = "gain-drift per_s ";
-    let (_, after) = said.unwrap().split_once(told).expect(said.unwrap());
+    let (_, after) = said.unwrap().split_once("gain-drift per_s ").unwrap();
     let number: String = (after.chars())
         .take_while(|c| c.is_ascii_digit() || *c == '.')
         .collect();
