@@ -273,7 +273,8 @@ fn a_picture_that_came_twice_repeats_its_position_for_who_counts_faults_of_the_c
     // No measurement: the bead has moved on.
     assert!(twice.iter().all(|&k| rows.output[k].is_nan()));
     let (_, delivered_um) = rows.delivered();
-    let repeats = (1..200).filter(|&k| delivered_um[k] == delivered_um[k - 1]);
+    // Nothing has moved in the first rows.
+    let repeats = (10..200).filter(|&k| delivered_um[k] == delivered_um[k - 1]);
     assert_eq!(repeats.collect::<Vec<_>>(), twice);
 }
 
