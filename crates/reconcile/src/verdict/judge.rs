@@ -159,9 +159,10 @@ fn without_effects(
         out.verdict = Verdict::Unknown;
         out.reasons
             .push("no effect of the catalogue explains it".to_owned());
-    } else if e.counted {
-        out.verdict = Verdict::Named;
     } else {
+        if e.counted {
+            out.verdict = Verdict::Named;
+        }
         out.reasons.extend(hidden::sentence(ctx, e.fit, threads));
     }
     if out.verdict == Verdict::Unknown {
