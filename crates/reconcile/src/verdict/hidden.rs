@@ -5,6 +5,7 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::Mask;
 use crate::search::cost::threshold_of;
+use crate::search::screen::change;
 use crate::units::figure;
 use cellpos_numeric::parallel;
 use cellpos_plant::effects::Role;
@@ -98,19 +99,9 @@ impl Seen<'_> {
     fn least_shown(&self, part: &Part, at: usize) -> Size {
         let candidate = part.variant();
         let values = part.natural();
-        let records = &self.ctx.problem.records;
-        let mut parts = self.fit.parts.clone();
-        parts.push(part.clone());
-        let with = self.ctx.simulated(&parts, self.fit.offset_um, &self.all);
-        let added: Vec<Vec<f64>> = (records.iter())
-            .zip(with.iter().zip(&self.sim))
-            .map(|(r, (with, without))| {
-                let added: Vec<f64> = with.iter().zip(without).map(|(a, b)| a - b).collect();
-                r.whitened(&added)
-            })
-            .collect();
+        let added = change(self.ctx, self.fit, &self.sim, part, &self.all);
         let gain = self.tangents.gain(&added, &self.fit.innovations, &self.all);
-        let needed = threshold_of(candidate, records.len()).sqrt() + SURELY;
+        let needed = threshold_of(candidate, self.ctx.problem.records.len()).sqrt() + SURELY;
         let from = (values[at] - candidate.neutral).abs();
         let size = from * needed / gain.own.sqrt();
         let number = &candidate.params[at];
