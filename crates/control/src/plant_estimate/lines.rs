@@ -35,6 +35,8 @@ const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
 /// Number of nearest bins on a side, and the ratio of a peak to their mean above the background from which on it is narrow. A tone that fills 0.4 of the window
 /// reaches 20, one that fills half the window 41; in less time two tones 1 Hz apart are one peak. Later nine in ten windows separate them.
 const SKIRT: usize = 6;
+/// Bins of half a main lobe of Hann's window.
+const LOBE: i64 = 2;
 const NARROW: f64 = 34.0;
 /// Mean time between two false candidates, s: each adds as much to the hold error as a line, for a second. The fixes that follow confirm
 /// one of a thousand of them: mean time between two false positives, s, 28 hours.
@@ -424,11 +426,21 @@ impl Lines {
                 count += 1;
             }
             let (_, median, _) = beside[..count].select_nth_unstable_by(count / 2, f64::total_cmp);
-            let skirt = |by: i64| self.power(bin - by) + self.power(bin + by);
-            let skirts: f64 = (aside..aside + SKIRT as i64).map(skirt).sum();
+            let clear = settings.peak * *median;
+            // A skirt ends where another line's main lobe begins: strokes of 3 Hz have one in each seventh bin.
+            let skirt = |side: i64| -> (f64, i64) {
+                let at = |by: i64| self.power(bin + side * by);
+                let is_line =
+                    |by: &i64| at(*by) > clear && at(*by) >= at(by - 1) && at(*by) > at(by + 1);
+                let end = aside + SKIRT as i64;
+                let lobe = (2 * LOBE..end + LOBE).find(is_line).unwrap_or(i64::MAX);
+                let end = end.min(lobe.saturating_sub(LOBE)).max(aside);
+                ((aside..end).map(at).sum(), end - aside)
+            };
+            let ((left, few), (right, more)) = (skirt(-1), skirt(1));
             // Powers of noise are exponential: their mean is the median over ln 2. The rest of the skirts is the peak's own.
-            let its_own = skirts / (2.0 * SKIRT as f64) - *median / LN_2;
-            if own > settings.peak * *median && own > NARROW * its_own {
+            let its_own = (left + right) / (few + more) as f64 - *median / LN_2;
+            if few.min(more) > 0 && own > clear && own > NARROW * its_own {
                 // Where the peak of Hann's window is between two bins.
                 let (side, sign) = if above > below {
                     (above, 1.0)
