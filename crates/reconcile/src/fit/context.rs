@@ -268,6 +268,26 @@ impl Context<'_> {
         self.problem.spend(work);
     }
 
+    /// By how much a part next to a set would change the innovations; `sim` is the set's simulation.
+    pub(crate) fn change(
+        &self,
+        fit: &Fit,
+        sim: &[Vec<f64>],
+        part: &Part,
+        mask: &Mask,
+    ) -> Vec<Vec<f64>> {
+        let mut parts = fit.parts.clone();
+        parts.push(part.clone());
+        let moved = self.simulated(&parts, fit.offset_um, mask);
+        (self.problem.records.iter())
+            .zip(moved.iter().zip(sim))
+            .map(|(r, (m, s))| {
+                let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| fit.gain * (s - m)).collect();
+                r.whitened(&d)
+            })
+            .collect()
+    }
+
     /// What a small addition to a record's command adds to its simulated position, per unit of the addition: the chain's tangent,
     /// with the delay and everything else that the set of a fit has in it. `sim` is the record as it is.
     pub(crate) fn response(

@@ -12,26 +12,6 @@ use crate::search::pixel::pixel_scan;
 use crate::search::suspect::{Suspect, lines_score};
 use cellpos_plant::effects::Role;
 
-/// By how much a part next to a set would change the innovations; `sim` is the set's simulation.
-pub(crate) fn change(
-    ctx: &Context<'_>,
-    fit: &Fit,
-    sim: &[Vec<f64>],
-    part: &Part,
-    mask: &Mask,
-) -> Vec<Vec<f64>> {
-    let mut parts = fit.parts.clone();
-    parts.push(part.clone());
-    let moved = ctx.simulated(&parts, fit.offset_um, mask);
-    (ctx.problem.records.iter())
-        .zip(moved.iter().zip(sim))
-        .map(|(r, (m, s))| {
-            let d: Vec<f64> = m.iter().zip(s).map(|(m, s)| fit.gain * (s - m)).collect();
-            r.whitened(&d)
-        })
-        .collect()
-}
-
 /// The best start of every variant not excluded, best first.
 pub(crate) fn screen(
     ctx: &Context<'_>,
@@ -49,7 +29,7 @@ pub(crate) fn screen(
     let scores = cellpos_numeric::parallel::map(&jobs, threads, |part| match part.variant().role {
         Role::Line { .. } => lines_score(ctx, fit, part, mask),
         _ => {
-            let d = change(ctx, fit, &sim, part, mask);
+            let d = ctx.change(fit, &sim, part, mask);
             let g = tangents.gain(&d, &fit.innovations, mask);
             if g.scale > 0.02 { g.score } else { 0.0 }
         }

@@ -5,7 +5,6 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
 use crate::problem::Mask;
 use crate::search::cost::threshold_of;
-use crate::search::screen::change;
 use crate::units::figure;
 use cellpos_numeric::parallel;
 use cellpos_plant::effects::Role;
@@ -99,7 +98,7 @@ impl Seen<'_> {
     fn least_shown(&self, part: &Part, at: usize) -> Size {
         let candidate = part.variant();
         let values = part.natural();
-        let added = change(self.ctx, self.fit, &self.sim, part, &self.all);
+        let added = (self.ctx).change(self.fit, &self.sim, part, &self.all);
         let gain = self.tangents.gain(&added, &self.fit.innovations, &self.all);
         let needed = threshold_of(candidate, self.ctx.problem.records.len()).sqrt() + SURELY;
         let from = (values[at] - candidate.neutral).abs();
