@@ -35,11 +35,11 @@ const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
 /// Number of nearest bins on a side, and the ratio of a peak to their mean above the background from which on it is narrow. A tone that fills 0.4 of the window
 /// reaches 20, one that fills half the window 41; in less time two tones 1 Hz apart are one peak. Later nine in ten windows separate them.
 const SKIRT: usize = 6;
+const NARROW: f64 = 34.0;
 /// Bins of half a main lobe of Hann's window.
 const LOBE: i64 = 2;
-const NARROW: f64 = 34.0;
 /// Mean time between two false candidates, s: each adds as much to the hold error as a line, for a second. The fixes that follow confirm
-/// one of a thousand of them: mean time between two false positives, s, 28 hours.
+/// one candidate in a thousand: mean time between two false positives, s, 28 hours.
 const CANDIDATE_S: f64 = 100.0;
 const FALSE_S: f64 = 1e5;
 /// Memory of amplitude and phase, s: a line that stops is gone in that time, and each line adds 0.3 % to the hold error.

@@ -160,7 +160,7 @@ pub(crate) fn freedom_of(v: &Candidate, records: usize) -> usize {
         }
 }
 
-/// Step of a tangent, as a share of the stroke: a curve is straight over it, and rounding is a millionth of it.
+/// Step of a tangent, as a share of the stroke: a curve is straight over it, and rounding errors are a millionth of the step.
 const SMALL: f64 = 1e-3;
 
 impl Context<'_> {
@@ -288,8 +288,8 @@ impl Context<'_> {
             .collect()
     }
 
-    /// What a small addition to a record's command adds to its simulated position, per unit of the addition: the chain's tangent,
-    /// with the delay and everything else that the set of a fit has in it. `sim` is the record as it is.
+    /// Change of a record's simulated position by a small addition to its command, per unit of the addition. It is the tangent of the
+    /// chain with all effects of a fit's set, the delay included. `sim` is the position without the addition.
     pub(crate) fn response(
         &self,
         fit: &Fit,

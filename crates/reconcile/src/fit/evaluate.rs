@@ -217,7 +217,7 @@ impl Context<'_> {
             self.add_offset_columns(fit, state, mask, next, &mut columns);
             next += 1;
         }
-        // A plant without a direct path has no share in its frames' edges: the number stands at nought and takes nothing off.
+        // Without a direct path there is no share of the edge: the number is 0, and no column is needed.
         let (low, high) = self.problem.soft;
         for (columns, soft) in columns.iter_mut().zip(&state.soft).filter(|_| low < high) {
             columns.push((next, soft.iter().map(|s| -s).collect()));

@@ -22,7 +22,7 @@ pub(crate) struct Gain {
     pub score: f64,
     /// That scale.
     pub scale: f64,
-    /// What the direction itself adds to the sum of squares, beside what the tangents take over.
+    /// Sum of squares of the direction, less the part that the tangents take over.
     pub own: f64,
 }
 

@@ -356,8 +356,8 @@ struct Selected {
     left: Vec<Vec<f64>>,
 }
 
-/// The formula for the innovations of a fit. A line with a separate amplitude and phase in every record is part of it if that says more: a
-/// response that is off makes lines of the command's sines, too, and its terms say as much.
+/// The formula for the innovations of a fit. A line with a separate amplitude and phase in every record is part of it if that says more. A
+/// wrong response also makes lines, of the command's sines, and its terms say as much.
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
     let (train, test) = split_in_time(&ctx.problem.records);
     let squares = |e: &[Vec<f64>]| inner(e, e, &test);

@@ -179,10 +179,12 @@ pub(crate) struct WithoutMemory {
 
 impl WithoutMemory {
     pub(crate) fn beside(ctx: &Context<'_>, set: &Fit) -> Self {
-        let by = |knots: &[f64]| gained_beside(ctx, set, bends(ctx, set, knots));
+        // A curve that bends where the range begins is a gain.
+        let curve = bends(ctx, set, &[&[0.0], &KNOTS[..]].concat());
+        let gain = curve.iter().map(|columns| columns[..1].to_vec()).collect();
         Self {
-            by_a_gain: by(&[0.0]),
-            by_a_curve: by(&[&[0.0], &KNOTS[..]].concat()),
+            by_a_gain: gained_beside(ctx, set, gain),
+            by_a_curve: gained_beside(ctx, set, curve),
             records: ctx.problem.records.len(),
         }
     }

@@ -1,4 +1,4 @@
-//! How large an effect may be and not show: what the verdict `nothing-missing` does not exclude.
+//! How large an effect may be and not show: the limits of the verdict `nothing-missing`.
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
@@ -30,8 +30,8 @@ struct Size {
     words: String,
 }
 
-/// The effects that the records of a fit may hide although they matter, each with its largest such size, as one sentence. What
-/// matters is known of this rig only.
+/// The effects that the records of a fit may hide although they matter, each with its largest such size, as one sentence. Which
+/// sizes matter is known for this rig only.
 pub(crate) fn sentence(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Option<String> {
     if ctx.problem.base.free_start {
         return None;

@@ -32,7 +32,7 @@ pub(super) struct Scenery {
     cells: Cells,
     clean8: Vec<u8>,
     clean16: Vec<u16>,
-    /// Always there, but for the empty scenery that stands in while this one is used.
+    /// There is always one, except in the empty scenery that replaces this one while it is used.
     level: Option<Level>,
 }
 

@@ -374,6 +374,7 @@ impl OnRig {
                 Err(_) => {}
             }
         }
+        let delivered_um = rows.delivered_um();
         Acquired {
             records,
             neutral_um: ticks
@@ -382,9 +383,9 @@ impl OnRig {
             age_s: rows.age_s(),
             fix_noise_um: fix_noise_um(ticks),
             frame_age_s: rows.frame_age_s(),
-            late_command: rows.stalled.clone(),
-            unseen: rows.unseen.clone(),
-            rows: rows.delivered(),
+            rows: (rows.input, delivered_um),
+            late_command: rows.stalled,
+            unseen: rows.unseen,
             out_of_view,
             trouble: None,
             run: None,

@@ -31,7 +31,7 @@ pub fn repeats_picture(tick: &TickRecord) -> bool {
     is_unseen(tick) && tick.decision == Decision::Stale as u8
 }
 
-/// The position before, for a row whose frame repeats it. So a record shows what the camera delivered, and its repeats can be counted.
+/// Gives a row whose frame repeats the picture before it the position before it, so that repeats can be counted.
 pub fn repeat_before(bead_um: &mut [f64], row: usize) {
     if row > 0 && row < bead_um.len() {
         bead_um[row] = bead_um[row - 1];
@@ -190,13 +190,13 @@ impl Rows {
         rows
     }
 
-    /// Commands and positions as the camera delivered them, um.
-    pub(crate) fn delivered(self) -> (Vec<f64>, Vec<f64>) {
-        let mut bead_um = self.output;
+    /// Positions as the camera delivered them, um.
+    pub(crate) fn delivered_um(&self) -> Vec<f64> {
+        let mut bead_um = self.output.clone();
         for row in (0..bead_um.len()).filter(|row| self.repeated[*row]) {
             repeat_before(&mut bead_um, row);
         }
-        (self.input, bead_um)
+        bead_um
     }
 
     /// Mean time from the middle of an exposure to its tick, s; `None` if no frame came in time.
