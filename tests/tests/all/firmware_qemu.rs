@@ -224,7 +224,18 @@ fn a_bead_is_held_through_arm_code_for_twenty_seconds() {
         bead.len()
     );
     // The bead drifts at 10 um/s and diffuses: not held, it would be 150 um away.
-    assert!(bead.len() > 5_000 && rms_um < 1.0, "{rms_um} um");
+    let seconds: Vec<String> = held
+        .chunk_by(|a, b| a.time_s.floor() == b.time_s.floor())
+        .map(|rows| {
+            let far_um = rows.iter().map(|row| row.bead_um.abs()).fold(0.0, f64::max);
+            format!("{:.0}: {far_um:.1}", rows[0].time_s)
+        })
+        .collect();
+    assert!(
+        bead.len() > 5_000 && rms_um < 1.0,
+        "{rms_um} um RMS; farthest by seconds, um: {seconds:?}; events:\n{}",
+        rig.events()
+    );
     assert!((rows.last().unwrap().applied_um - PARK_UM).abs() < 0.01);
 }
 

@@ -96,10 +96,16 @@ impl Adapter {
             .zip(state.instrument.innovations(&correction, &chosen_um));
         let Some(((seen, p), x)) = series else {
             state.seen = Some(Whitener::begin(fix.position_um));
+            state.cancelled_seen = Whitener::begin(0.0);
             state.model.begin(at_um);
             state.instrument.begin(chosen_um);
             return false;
         };
+        let shown_ago = delay + DELAYS[state.force.member] + ago;
+        let cancelled_um = state.cancelled.seen(shown_ago, self.exposure_ticks);
+        let cancelled_um = cancelled_um.unwrap_or(0.0);
+        let cancelled = correction.innovation(&state.cancelled_seen, cancelled_um);
+        correction.step(&mut state.cancelled_seen, cancelled);
         let y = correction.innovation(seen, fix.position_um);
         correction.step(seen, y);
         state.model.follow(&correction, &p);
@@ -129,11 +135,10 @@ impl Adapter {
         // The error of the model along a reference is not a line.
         let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
         if chosen_um * chosen_um < usual_um2 {
-            let left_um = (y - gain * in_force) / gain;
-            let noise_um2 = state.colour.white_um2 / (gain * gain);
-            let shown_ago = delay + late + ago;
-            let left = (left_um, noise_um2);
-            (state.lines).learn(&self.lines, &self.whitener, left, shown_ago);
+            // What is cancelled shakes the plant all the same.
+            let disturbed_um = (y - gain * in_force) / gain - scale * cancelled;
+            let fix = (disturbed_um, usual_um2 / (gain * gain));
+            (state.lines).learn(&self.lines, &self.whitener, fix, shown_ago);
         }
         let mut series = [0.0; 1 + 2 * MEMBERS];
         series[0] = y;

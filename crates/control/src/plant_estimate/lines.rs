@@ -1,12 +1,14 @@
 //! Periodic disturbances: strokes of a pump and their harmonics, mains hum, a fan. They are detected in the residual of the fixes, tracked
 //! in amplitude, phase and frequency, and cancelled by the command.
 //!
-//! Each line is an oscillator in the disturbance model. The residual of the fixes passes the filter of [`super::whiten`]; there an
-//! error `dz` of an oscillator is `Re(S dz)` plus white noise, with `S` the response of that filter at the line's frequency. A Kalman
-//! filter of amplitude, phase, frequency and drift of the frequency follows from that. The command cancels the line through the inverse of
-//! the model. Estimator and regression leave this part of the command out, because the disturbance cancels it. A line is tracked if its peak
-//! in a spectrum exceeds the neighbouring bins, counts if the fixes that follow show it beyond chance, and is removed if its amplitude is
-//! no larger than chance.
+//! Each line is an oscillator in the disturbance model. The fixes pass the filter of [`super::whiten`], which answers an oscillator `z` with
+//! `Re(S z)` plus white noise, where `S` is the response of that filter at the line's frequency. One Kalman filter of the amplitude, phase,
+//! frequency and drift of all lines follows from that. It sees the disturbance as it would be if nothing were cancelled, so what it corrects
+//! does not shake it. The command moves the bead against the lines through the inverse of the model. Estimator and regression leave
+//! this part of the command out, because the disturbance cancels it.
+//!
+//! A line is tracked if its peak in a spectrum of what the lines leave exceeds the neighbouring bins and is one steady tone. It is
+//! cancelled once the fixes that follow show it beyond chance, and removed if its amplitude is no larger than chance.
 //!
 //! Amplitudes are in units of the command (bead motion over the gain in force): they stay valid when the gain in force changes.
 
@@ -32,28 +34,26 @@ const ONE_LINE: f64 = 1.5;
 /// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
 /// than half.
 const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
-/// Number of nearest bins on a side, and the ratio of a peak to their mean above the background from which on it is narrow. A tone that fills 0.4 of the window
-/// reaches 20, one that fills half the window 41; in less time two tones 1 Hz apart are one peak. Later nine in ten windows separate them.
-const SKIRT: usize = 6;
-const NARROW: f64 = 34.0;
-/// Bins of half a main lobe of Hann's window.
-const LOBE: i64 = 2;
-/// Mean time between two false candidates, s: each adds as much to the hold error as a line, for a second. The fixes that follow confirm
-/// one candidate in a thousand: mean time between two false positives, s, 28 hours.
+/// Part of a peak that a single steady tone may leave unexplained. A line at 100 Hz leaves 0.09 if it drifts by [`DRIFT_PER_S`], a tone that
+/// fills two thirds of the window 0.1, two tones 1 Hz apart that this window shows as one 0.65, and 0.00 if it shows both.
+const UNEXPLAINED: f64 = 0.1;
+/// Power that noise adds to that, over its mean in a bin: the tone is fitted to three bins, and 95 % of sums of two exponentials are less.
+const NOISE_LEFT: f64 = 4.744;
+/// Mean time between two false candidates, s. They cost nothing: the fixes that follow confirm one candidate in a thousand. Mean time between
+/// two false positives, s, 28 hours.
 const CANDIDATE_S: f64 = 100.0;
 const FALSE_S: f64 = 1e5;
-/// Memory of amplitude and phase, s: a line that stops is gone in that time, and each line adds 0.3 % to the hold error.
-const MEMORY_S: f64 = 0.5;
+/// Memory of amplitude and phase, s: a line that stops is gone in twice that time, and each line adds 0.7 % to the hold error at 1 kHz.
+const MEMORY_S: f64 = 1.0;
 /// Standard deviations of a new line. Amplitude, um: the largest that a loop follows. Frequency, bins: the interpolated peak of a line
 /// that fills a part of the window.
 const FIRST_UM: f64 = 1.0;
 const FIRST_BINS: f64 = 0.25;
-/// Square of an amplitude over its variance below which a line is removed: two standard deviations. A false positive is then
-/// removed within a second.
+/// Square of an amplitude over its variance below which a line is removed: two standard deviations.
 const GONE: f64 = 4.0;
 /// Relative drift of a frequency, 1/s: a motor that warms up; and the time in which it changes by as much, s.
 const DRIFT_PER_S: f64 = 0.01;
-const STEADY_S: f64 = 1000.0;
+const STEADY_S: f64 = 450.0;
 
 /// Sampling of the spectrum.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,35 +72,30 @@ pub(super) struct LineSettings {
 /// One line.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Line {
-    /// Its motion of the bead now is the real part, um over the gain in force.
-    z: [f64; 2],
+    /// Its motion of the bead now is the real part of the amplitude (um over the gain in force) times the phase.
+    amplitude: [f64; 2],
+    phase: [f64; 2],
     /// Angle in a tick, rad.
     turn: f64,
     /// Change of that angle in a fix.
     drift: f64,
-    /// Variance of the amplitude, um^2.
-    radial_um2: f64,
+    /// Fixes since it was found.
+    fixes: f64,
     /// The fixes after the spectrum show it as well.
     confirmed: bool,
-    /// Covariance of the error across (um), the angle in a fix (rad) and its change.
-    across: [[f64; 3]; 3],
 }
 
-/// A fix as a line sees it.
-struct Residual {
-    left_um: f64,
-    noise_um2: f64,
-    /// Ticks since the exposure.
-    ago: f64,
-    /// Response of the whitening filter at the frequency.
-    seen: [f64; 2],
-}
+/// Errors of a line: both parts of the amplitude (um), the angle in a fix (rad) and its change.
+const ERRORS: usize = 4;
+const ALL_ERRORS: usize = ERRORS * MOST;
 
 /// The lines, and the search for more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Lines {
     lines: [Line; MOST],
     count: usize,
+    /// Covariance of the errors of all.
+    covariance: [[f64; ALL_ERRORS]; ALL_ERRORS],
     kept: [f32; KEPT],
     /// Samples so far, and the one that is being made.
     samples: usize,
@@ -110,8 +105,6 @@ pub(super) struct Lines {
     from: usize,
     bin: usize,
     at: usize,
-    /// The first sample after the last line found was cancelled.
-    clean: usize,
     filter: [[f64; 2]; AT_ONCE],
     spectrum: [[f32; 2]; BINS],
     judged: usize,
@@ -175,84 +168,25 @@ fn peak_over_median(bins: usize, looks: f64) -> f64 {
     invert(looks, 0.0, 1e6, logarithm)
 }
 
+/// Hann's main lobe, some bins from the tone.
+fn main_lobe(bins: f64) -> f64 {
+    let angle = std::f64::consts::PI * bins;
+    let sinc = if angle.abs() < 1e-6 {
+        1.0
+    } else {
+        angle.sin() / angle
+    };
+    match 1.0 - bins * bins {
+        edge if edge.abs() < 1e-6 => 0.5,
+        edge => sinc / edge,
+    }
+}
+
 impl Line {
-    fn new(settings: &LineSettings, turn: f64) -> Self {
-        let angle = turn * settings.interval;
-        let unsure = [
-            FIRST_UM,
-            settings.turn(FIRST_BINS) * settings.interval,
-            DRIFT_PER_S * settings.fix_s() * angle,
-        ];
-        let mut across = [[0.0; 3]; 3];
-        for (i, sd) in unsure.into_iter().enumerate() {
-            across[i][i] = sd * sd;
-        }
-        Self {
-            z: [0.0; 2],
-            turn,
-            drift: 0.0,
-            radial_um2: FIRST_UM * FIRST_UM,
-            confirmed: false,
-            across,
-        }
-    }
-
-    /// A fix with this residual; `apart` is the angle in a tick to the nearest other component, rad. Whether the amplitude is as well known as
-    /// it will be.
-    fn follow(&mut self, settings: &LineSettings, residual: &Residual, apart: f64) -> bool {
-        let angle = self.turn * settings.interval;
-        let seen2 = square(residual.seen);
-        // One fix shows one quadrature; the mean over a beat with the nearest component shows both, and no memory is shorter than that.
-        let change = product(
-            [residual.seen[0], -residual.seen[1]],
-            unit(self.turn * residual.ago),
-        )
-        .map(|part| 2.0 * residual.left_um / seen2 * part);
-        let white_um2 = 2.0 * residual.noise_um2 / seen2;
-        let most = (apart * settings.interval / TAU).clamp(1e-4, 0.5);
-        let memory = (MEMORY_S / settings.fix_s()).max(1.0 / most);
-        let wander_um2 = white_um2 / (memory * memory);
-        let size = square(self.z).sqrt();
-        let way = match self.z.map(|um| um / size) {
-            way if size > 1e-9 => way,
-            _ => [1.0, 0.0],
-        };
-        let [along_um, across_um] = product(change, [way[0], -way[1]]);
-
-        self.radial_um2 += wander_um2;
-        let gain = (self.radial_um2 / (self.radial_um2 + white_um2)).min(most);
-        self.radial_um2 = (1.0 - gain).powi(2) * self.radial_um2 + gain * gain * white_um2;
-
-        self.onward(size);
-        self.across[0][0] += wander_um2;
-        let changes = DRIFT_PER_S * settings.fix_s() * angle;
-        self.across[2][2] += changes * changes * settings.fix_s() / STEADY_S;
-        // More noise than there is, so that the gain stays below `most`.
-        let fix_um2 = white_um2.max(self.across[0][0] * (1.0 / most - 1.0));
-        let all_um2 = self.across[0][0] + fix_um2;
-        let gains = self.across.map(|row| row[0] / all_um2);
-        for (row, gain) in self.across.iter_mut().zip(gains) {
-            for (p, other) in row.iter_mut().zip(gains) {
-                *p -= gain * other * all_um2;
-            }
-        }
-        let step = product([gain * along_um, gains[0] * across_um], way);
-        self.z = [self.z[0] + step[0], self.z[1] + step[1]];
-        self.turn += (self.drift + gains[1] * across_um) / settings.interval;
-        self.drift += gains[2] * across_um;
-        self.radial_um2 < 2.0 * white_um2 / memory
-    }
-
-    /// The covariance one fix on: an error of the angle moves a line of this size across, a drift changes the angle.
-    fn onward(&mut self, size_um: f64) {
-        let p = &mut self.across;
-        let [position, angle, drift] = *p;
-        p[0] = std::array::from_fn(|j| position[j] + size_um * angle[j]);
-        p[1] = std::array::from_fn(|j| angle[j] + drift[j]);
-        for row in p.iter_mut() {
-            row[0] += size_um * row[1];
-            row[1] += row[2];
-        }
+    /// Its motion of the bead some ticks from now, um.
+    fn at_um(&self, ticks: f64) -> f64 {
+        let phase = product(self.phase, unit(self.turn * ticks));
+        product(self.amplitude, phase)[0]
     }
 }
 
@@ -261,6 +195,7 @@ impl Lines {
         Self {
             lines: [Line::default(); MOST],
             count: 0,
+            covariance: [[0.0; ALL_ERRORS]; ALL_ERRORS],
             kept: [0.0; KEPT],
             samples: 0,
             sum: 0.0,
@@ -268,7 +203,6 @@ impl Lines {
             from: 0,
             bin: 0,
             at: WINDOW,
-            clean: 0,
             filter: [[0.0; 2]; AT_ONCE],
             spectrum: [[0.0; 2]; BINS],
             judged: BINS,
@@ -284,16 +218,16 @@ impl Lines {
         &self.lines[..self.count]
     }
 
-    /// Motion of the bead by the lines `ticks` ticks from now, um.
+    /// Motion of the bead by the confirmed lines `ticks` ticks from now, um.
     pub(super) fn at_um(&self, ticks: f64) -> f64 {
-        let of = |line: &Line| product(line.z, unit(line.turn * ticks))[0];
-        self.now().iter().map(of).sum()
+        let confirmed = self.now().iter().filter(|line| line.confirmed);
+        confirmed.map(|line| line.at_um(ticks)).sum()
     }
 
     /// A tick on; a part of the search.
     pub(super) fn tick(&mut self, settings: &LineSettings) {
         for line in &mut self.lines[..self.count] {
-            line.z = product(line.z, unit(line.turn));
+            line.phase = product(line.phase, unit(line.turn));
         }
         self.ticks += 1;
         if self.ticks >= settings.ticks {
@@ -308,34 +242,41 @@ impl Lines {
         }
     }
 
-    /// The residual of a fix that is `ago` ticks old, and its variance without lines, um and um^2.
+    /// A whitened fix of the disturbance that is `ago` ticks old, as if nothing were cancelled, and its variance without lines, um and um^2.
     pub(super) fn learn(
         &mut self,
         settings: &LineSettings,
         whitener: &Whitener,
-        (left_um, noise_um2): (f64, f64),
+        (fix_um, noise_um2): (f64, f64),
         ago: f64,
     ) {
+        let memory = MEMORY_S / settings.fix_s();
+        let mut shown = [0.0; ALL_ERRORS];
+        let mut left_um = fix_um;
+        for k in 0..self.count {
+            let line = self.lines[k];
+            let angle = line.turn * settings.interval;
+            let seen = whitener.response(angle);
+            // A fix shows one of both parts of an amplitude.
+            let wander_um2 = 2.0 * noise_um2 / (square(seen) * memory * memory);
+            let changes = DRIFT_PER_S * settings.fix_s() * angle;
+            self.onward(
+                k,
+                wander_um2,
+                changes * changes * settings.fix_s() / STEADY_S,
+            );
+            let seen = product(seen, product(line.phase, unit(-line.turn * ago)));
+            (shown[ERRORS * k], shown[ERRORS * k + 1]) = (seen[0], -seen[1]);
+            left_um -= product(seen, line.amplitude)[0];
+        }
         self.sum += left_um;
+        self.correct(&shown, left_um, noise_um2, settings.interval);
         let mut k = 0;
         while k < self.count {
-            let turn = self.lines[k].turn;
-            // Its own mirror image is a component as well.
-            let mut apart = 2.0 * turn;
-            for (other, line) in self.now().iter().enumerate() {
-                if other != k {
-                    apart = apart.min((line.turn - turn).abs());
-                }
-            }
-            let residual = Residual {
-                left_um,
-                noise_um2,
-                ago,
-                seen: whitener.response(turn * settings.interval),
-            };
+            let over = square(self.lines[k].amplitude) / self.variance_um2(k);
             let line = &mut self.lines[k];
-            let settled = line.follow(settings, &residual, apart);
-            let over = square(line.z) / line.radial_um2;
+            line.fixes += 1.0;
+            let settled = line.fixes > memory;
             let gone = settled && over < GONE;
             line.confirmed |= settled && over > settings.sure;
             let turn = line.turn;
@@ -350,15 +291,72 @@ impl Lines {
         }
     }
 
+    /// The covariance one fix on: the amplitude wanders, an error of the angle turns it, a drift changes the angle.
+    fn onward(&mut self, k: usize, wander_um2: f64, changes: f64) {
+        let [re, im] = self.lines[k].amplitude;
+        let n = ERRORS * self.count;
+        let [a, b, angle, drift] = std::array::from_fn(|i| ERRORS * k + i);
+        let p = &mut self.covariance;
+        for j in 0..n {
+            p[a][j] -= im * p[angle][j];
+            p[b][j] += re * p[angle][j];
+            p[angle][j] += p[drift][j];
+        }
+        for row in &mut p[..n] {
+            row[a] -= im * row[angle];
+            row[b] += re * row[angle];
+            row[angle] += row[drift];
+        }
+        p[a][a] += wander_um2;
+        p[b][b] += wander_um2;
+        p[drift][drift] += changes;
+    }
+
+    /// All lines by one fix, which shows these parts of their errors.
+    fn correct(&mut self, shown: &[f64; ALL_ERRORS], left_um: f64, noise_um2: f64, interval: f64) {
+        let n = ERRORS * self.count;
+        let mut with = [0.0; ALL_ERRORS];
+        for (with, row) in with[..n].iter_mut().zip(&self.covariance) {
+            *with = row.iter().zip(shown).take(n).map(|(p, h)| p * h).sum();
+        }
+        let variance_um2: f64 = noise_um2 + with.iter().zip(shown).map(|(p, h)| p * h).sum::<f64>();
+        for (row, one) in self.covariance.iter_mut().zip(with).take(n) {
+            let gain = one / variance_um2;
+            for (p, other) in row.iter_mut().zip(with).take(n) {
+                *p -= gain * other;
+            }
+        }
+        for (k, line) in self.lines[..self.count].iter_mut().enumerate() {
+            let [re, im, angle, drift] =
+                std::array::from_fn(|i| with[ERRORS * k + i] / variance_um2 * left_um);
+            line.amplitude = [line.amplitude[0] + re, line.amplitude[1] + im];
+            line.turn += (line.drift + angle) / interval;
+            line.drift += drift;
+        }
+    }
+
+    /// Variance of the size of an amplitude, um^2.
+    fn variance_um2(&self, k: usize) -> f64 {
+        let [re, im] = self.lines[k].amplitude;
+        let p = |i: usize, j: usize| self.covariance[ERRORS * k + i][ERRORS * k + j];
+        let size2 = (re * re + im * im).max(f64::MIN_POSITIVE);
+        (re * re * p(0, 0) + 2.0 * re * im * p(0, 1) + im * im * p(1, 1)) / size2
+    }
+
     fn remove(&mut self, k: usize) {
+        let n = ERRORS * self.count;
         self.count -= 1;
         self.lines.copy_within(k + 1.., k);
+        self.covariance.copy_within(ERRORS * (k + 1)..n, ERRORS * k);
+        for row in &mut self.covariance {
+            row.copy_within(ERRORS * (k + 1)..n, ERRORS * k);
+        }
     }
 
     /// Goertzel's filters of some bins on their way through the window.
     fn transform(&mut self, settings: &LineSettings) {
         if self.bin == 0 && self.at >= WINDOW {
-            if self.samples < self.clean + WINDOW {
+            if self.samples < WINDOW {
                 return;
             }
             (self.from, self.at) = (self.samples - WINDOW, 0);
@@ -389,17 +387,43 @@ impl Lines {
         }
     }
 
-    /// Power in a bin under Hann's window; a spectrum of real numbers is its own mirror.
-    fn power(&self, bin: i64) -> f64 {
+    /// Value of a bin under Hann's window, its sign such that those of one tone have one phase. A spectrum of real numbers is its own mirror.
+    fn value(&self, bin: i64) -> [f64; 2] {
         let of = |bin: i64| {
             let [re, im] = self.spectrum[bin.unsigned_abs() as usize].map(f64::from);
             [re, if bin < 0 { -im } else { im }]
         };
         let (before, at, after) = (of(bin - 1), of(bin), of(bin + 1));
-        square([
-            at[0] - 0.5 * (before[0] + after[0]),
-            at[1] - 0.5 * (before[1] + after[1]),
-        ])
+        let sign = if bin % 2 == 0 { 1.0 } else { -1.0 };
+        std::array::from_fn(|i| sign * (at[i] - 0.5 * (before[i] + after[i])))
+    }
+
+    fn power(&self, bin: i64) -> f64 {
+        square(self.value(bin))
+    }
+
+    /// Frequency of the tone of a peak, in bins from it towards its larger neighbour on `side`, and the power that this tone does not explain
+    /// there and one bin further.
+    fn tone(&self, bin: i64, side: i64) -> (f64, f64) {
+        let values: [[f64; 2]; 3] = std::array::from_fn(|i| self.value(bin + side * i as i64));
+        let ratio = (square(values[1]) / square(values[0])).sqrt();
+        let off = (2.0 * ratio - 1.0) / (ratio + 1.0);
+        let lobe: [f64; 3] = std::array::from_fn(|i| main_lobe(i as f64 - off));
+        let over = 1.0 / (lobe[0] * lobe[0] + lobe[1] * lobe[1]);
+        let amplitude: [f64; 2] = std::array::from_fn(|part| {
+            over * (lobe[0] * values[0][part] + lobe[1] * values[1][part])
+        });
+        let left = values
+            .iter()
+            .zip(lobe)
+            .map(|(value, lobe)| {
+                square([
+                    value[0] - lobe * amplitude[0],
+                    value[1] - lobe * amplitude[1],
+                ])
+            })
+            .sum();
+        (off, left)
     }
 
     /// Whether the next few bins hold lines.
@@ -426,32 +450,12 @@ impl Lines {
                 count += 1;
             }
             let (_, median, _) = beside[..count].select_nth_unstable_by(count / 2, f64::total_cmp);
-            let clear = settings.peak * *median;
-            // A skirt ends where another line's main lobe begins: strokes of 3 Hz have one in each seventh bin.
-            let skirt = |side: i64| -> (f64, i64) {
-                let at = |by: i64| self.power(bin + side * by);
-                let is_line =
-                    |by: &i64| at(*by) > clear && at(*by) >= at(by - 1) && at(*by) > at(by + 1);
-                let end = aside + SKIRT as i64;
-                let lobe = (2 * LOBE..end + LOBE).find(is_line).unwrap_or(i64::MAX);
-                let end = end.min(lobe.saturating_sub(LOBE)).max(aside);
-                ((aside..end).map(at).sum(), end - aside)
-            };
-            let ((left, few), (right, more)) = (skirt(-1), skirt(1));
-            // Powers of noise are exponential: their mean is the median over ln 2. The rest of the skirts is the peak's own.
-            let its_own = (left + right) / (few + more) as f64 - *median / LN_2;
-            if few.min(more) > 0 && own > clear && own > NARROW * its_own {
-                // Where the peak of Hann's window is between two bins.
-                let (side, sign) = if above > below {
-                    (above, 1.0)
-                } else {
-                    (below, -1.0)
-                };
-                let ratio = (side / own).sqrt();
-                self.add(
-                    settings,
-                    bin as f64 + sign * (2.0 * ratio - 1.0) / (ratio + 1.0),
-                );
+            let side = if above > below { 1 } else { -1 };
+            let (off, left) = self.tone(bin, side);
+            // Powers of noise are exponential: their mean is the median over ln 2.
+            let may_be_left = UNEXPLAINED * own + NOISE_LEFT * *median / LN_2;
+            if own > settings.peak * *median && left < may_be_left {
+                self.add(settings, bin as f64 + side as f64 * off);
             }
         }
         self.judged += AT_ONCE;
@@ -465,11 +469,25 @@ impl Lines {
         let turn = settings.turn(bin);
         let known = |line: &Line| (line.turn - turn).abs() < settings.turn(ONE_LINE);
         if self.count < MOST && !self.now().iter().any(known) {
-            self.lines[self.count] = Line::new(settings, turn);
+            self.lines[self.count] = Line {
+                phase: [1.0, 0.0],
+                turn,
+                ..Line::default()
+            };
+            let angle = turn * settings.interval;
+            let unsure = [
+                FIRST_UM,
+                FIRST_UM,
+                settings.turn(FIRST_BINS) * settings.interval,
+                DRIFT_PER_S * settings.fix_s() * angle,
+            ];
+            for (i, sd) in unsure.into_iter().enumerate() {
+                let at = ERRORS * self.count + i;
+                self.covariance[at].fill(0.0);
+                (self.covariance.iter_mut()).for_each(|row| row[at] = 0.0);
+                self.covariance[at][at] = sd * sd;
+            }
             self.count += 1;
-            // A window in which it is cancelled only in part has side lobes that would pass for lines.
-            let settled = MEMORY_S / (settings.sample_s * f64::from(settings.ticks));
-            self.clean = self.samples + settled as usize;
         }
     }
 }

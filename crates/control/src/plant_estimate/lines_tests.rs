@@ -33,13 +33,8 @@ impl White {
             self.tick += 1;
             let before = self.lines.count;
             if self.tick.is_multiple_of(settings.interval as u64) {
-                let shown = |line: &Line| {
-                    let seen = self.whitener.response(line.turn * settings.interval);
-                    product(seen, product(line.z, unit(-line.turn * AGO)))[0]
-                };
-                let cancelled: f64 = self.lines.now().iter().map(shown).sum();
-                let left_um = self.random.normal() - cancelled;
-                (self.lines).learn(&settings, &self.whitener, (left_um, 1.0), AGO);
+                let fix_um = self.random.normal();
+                (self.lines).learn(&settings, &self.whitener, (fix_um, 1.0), AGO);
             }
             self.lines.tick(&settings);
             self.found += self.lines.count.saturating_sub(before);

@@ -118,6 +118,9 @@ pub struct AdaptState {
     /// The model on the path that cancels the lines, and its next command, um; `None` while the loop does not control the bead.
     inverse: Option<FeedForwardState>,
     cancel_um: f64,
+    /// The model, driven with these commands, and its positions in the filter.
+    cancelled: Motion,
+    cancelled_seen: Track,
     force: Retuning,
     news: Option<AdaptNews>,
 }
@@ -196,6 +199,8 @@ impl Adapter {
             lines: Lines::new(),
             inverse: None,
             cancel_um: 0.0,
+            cancelled: Motion::start(0.0),
+            cancelled_seen: Track::default(),
             force: Retuning::default(),
             news: None,
         }
@@ -296,7 +301,8 @@ impl Adapter {
         state.news = None;
         let learned = self.learn(state, tick.fix.filter(|_| tick.free));
         let rest_um = tick.command_um - tick.cancel_um;
-        let finite = self.drive(state, rest_um, tick.chosen_um);
+        let finite = self.drive(state, rest_um, tick.chosen_um)
+            && state.cancelled.drive(&self.nominal, tick.cancel_um);
         state.lines.tick(&self.lines);
         self.cancel_lines(state, tick.free);
         if !tick.free {
@@ -325,7 +331,8 @@ impl Adapter {
         let rest_um = command_um - state.cancel_um;
         let finite = state.model.drive(&self.nominal, rest_um)
             && (state.instrument).drive(&self.nominal, state.dither.given_um)
-            && state.dither.hold(&self.nominal);
+            && state.dither.hold(&self.nominal)
+            && state.cancelled.drive(&self.nominal, state.cancel_um);
         state.lines.tick(&self.lines);
         self.cancel_lines(state, state.inverse.is_some());
         if !finite {
@@ -333,15 +340,17 @@ impl Adapter {
         }
     }
 
-    /// The command of the next tick: it moves the model opposite to the lines.
+    /// The command of the next tick: it moves the model opposite to the lines. What a new estimate of them corrects moves nothing: the law
+    /// has brought the bead to its reference, wherever it stands on its way.
     fn cancel_lines(&self, state: &mut AdaptState, free: bool) {
         state.cancel_um = 0.0;
         if !free {
             state.inverse = None;
             return;
         }
-        let (now_um, next_um) = (-state.lines.at_um(0.0), -state.lines.at_um(1.0));
-        let model = state.inverse.get_or_insert(FeedForward::rest(now_um));
+        let way_um = state.lines.at_um(1.0) - state.lines.at_um(0.0);
+        let model = state.inverse.get_or_insert(FeedForward::rest(0.0));
+        let next_um = self.forward.position(model) - way_um;
         state.cancel_um = self.forward.step(model, next_um);
     }
 
