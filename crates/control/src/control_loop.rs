@@ -296,10 +296,8 @@ impl<L: ControlLaw> ControlLoop<L> {
                     0.0
                 },
                 cancel_um,
-                free: tick.controls
-                    && !estimate.stuck
-                    && !estimate.stepped
-                    && !output.flags.not_finite,
+                free: tick.controls && !estimate.stuck && !output.flags.not_finite,
+                stepped: estimate.stepped,
             };
             self.change_estimate(state, |adapter, adapt| adapter.step(adapt, &told));
         }

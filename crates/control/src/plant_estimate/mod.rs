@@ -146,6 +146,8 @@ pub(crate) struct TickOutcome {
     pub cancel_um: f64,
     /// The law decides, and nothing holds the bead.
     pub free: bool,
+    /// The flow has just stepped: the fixes tell nothing of the plant.
+    pub stepped: bool,
 }
 
 impl Adapter {
@@ -299,14 +301,17 @@ impl Adapter {
     /// of the next tick.
     pub(crate) fn step(&self, state: &mut AdaptState, tick: &TickOutcome) {
         state.news = None;
-        let learned = self.learn(state, tick.fix.filter(|_| tick.free));
+        let learns = tick.free && !tick.stepped;
+        let learned = self.learn(state, tick.fix.filter(|_| learns));
         let rest_um = tick.command_um - tick.cancel_um;
         let finite = self.drive(state, rest_um, tick.chosen_um)
             && state.cancelled.drive(&self.nominal, tick.cancel_um);
         state.lines.tick(&self.lines);
         self.cancel_lines(state, tick.free);
-        if !tick.free {
+        if !learns {
             state.force.wait();
+        }
+        if !tick.free {
             state.dither.rest();
         }
         if !finite {
