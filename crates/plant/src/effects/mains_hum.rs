@@ -1,11 +1,10 @@
 //! `mains-hum`: a line at the frequency of the mains.
 
-use super::candidate::one;
+use super::pump_pulsation::Strokes;
 use super::{
-    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Role, Scope,
-    Shown, Spec, lin,
+    Action, Candidate, Effect, EffectKind, Experiment, FitParameter, Form, ParameterSpec, Place,
+    Role, Scope, Spec, lin,
 };
-use std::f64::consts::TAU;
 
 /// Camera, light or table. A line `um sin(2 pi hz t + phase)`, not tied to the input.
 pub fn mains_hum(hz: f64, um: f64, phase_deg: f64) -> Effect {
@@ -41,44 +40,27 @@ impl EffectKind for MainsHum {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Show(Box::new(Line {
-            w: TAU * effect.scalar(0),
-            um: effect.scalar(1),
-            phase: effect.scalar(2).to_radians(),
-        }))
+        let [hz, um, phase_deg] = std::array::from_fn(|i| effect.scalar(i));
+        Action::Show(Box::new(Strokes::new(hz, um, 0.0, phase_deg)))
     }
 
+    /// The frequency of a public grid stays within 1 % (EN 50160). A line at another frequency is no hum.
     fn candidates(&self) -> &'static [Candidate] {
-        const ALL: &[Candidate] = &[Candidate {
-            off_response: true,
-            role: Role::Line { harmonics: 1 },
-            ..Candidate::chain(&[lin("hz", 45.0, 65.0, 1e-3)])
-        }];
+        const fn line(hz: &'static [FitParameter]) -> Candidate {
+            Candidate {
+                off_response: true,
+                role: Role::Line { harmonics: 1 },
+                ..Candidate::chain(hz)
+            }
+        }
+        const ALL: &[Candidate] = &[
+            line(&[lin("hz", 49.5, 50.5, 1e-3)]),
+            line(&[lin("hz", 59.4, 60.6, 1e-3)]),
+        ];
         ALL
-    }
-
-    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
-        one([50.0, 60.0])
     }
 
     fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
         Effect::new(self, 0, values, &[])
-    }
-}
-
-#[derive(Debug, Clone)]
-struct Line {
-    w: f64,
-    um: f64,
-    phase: f64,
-}
-
-impl Shown for Line {
-    fn show(&mut self, seen_um: f64, time_s: f64) -> f64 {
-        seen_um + self.um * (self.w * time_s + self.phase).sin()
-    }
-
-    fn duplicate(&self) -> Box<dyn Shown> {
-        Box::new(self.clone())
     }
 }

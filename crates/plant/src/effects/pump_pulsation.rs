@@ -41,12 +41,8 @@ impl EffectKind for PumpPulsation {
     }
 
     fn act(&self, effect: &Effect) -> Action {
-        Action::Show(Box::new(Strokes {
-            w: TAU * effect.scalar(0),
-            um: effect.scalar(1),
-            second: effect.scalar(2),
-            phase: effect.scalar(3).to_radians(),
-        }))
+        let [hz, um, second, phase_deg] = std::array::from_fn(|i| effect.scalar(i));
+        Action::Show(Box::new(Strokes::new(hz, um, second, phase_deg)))
     }
 
     /// The harmonics of a stroke fall off at least as their number: five hold 89 % of the power of a saw-tooth.
@@ -64,12 +60,24 @@ impl EffectKind for PumpPulsation {
     }
 }
 
+/// A line and its second harmonic, over the line.
 #[derive(Debug, Clone)]
-struct Strokes {
+pub(super) struct Strokes {
     w: f64,
     um: f64,
     second: f64,
     phase: f64,
+}
+
+impl Strokes {
+    pub(super) fn new(hz: f64, um: f64, second: f64, phase_deg: f64) -> Self {
+        Self {
+            w: TAU * hz,
+            um,
+            second,
+            phase: phase_deg.to_radians(),
+        }
+    }
 }
 
 impl Shown for Strokes {

@@ -85,10 +85,14 @@ pub(crate) fn line_starts(
 
 /// Power of the innovations by frequency: the gain of a line of that frequency.
 struct Spectra {
-    /// From one frequency to the next, Hz.
+    /// From one frequency to the next, Hz, and how many of these steps tell two lines apart.
     step_hz: f64,
+    apart: usize,
+    records: f64,
     /// Of all records.
     whole: Vec<f64>,
+    /// That of the simulated response and of its distortions.
+    response: Vec<f64>,
     /// Of the parts of each record, with their share of the rows.
     parts: Vec<(f64, Vec<f64>)>,
 }
@@ -117,10 +121,22 @@ impl Spectra {
             Some((count as f64, powers))
         };
         let (mut whole, mut parts, mut count) = (vec![0.0; kept], Vec::new(), 0.0);
-        for (e, ranges) in fit.innovations.iter().zip(mask) {
+        let mut response = vec![0.0; kept];
+        let add = |sum: &mut [f64], power: &[f64]| {
+            sum.iter_mut().zip(power).for_each(|(sum, x)| *sum += x);
+        };
+        let simulated = ctx.simulated(&fit.parts, fit.offset_um, mask);
+        for (((e, ranges), record), simulated) in (fit.innovations.iter().zip(mask))
+            .zip(&ctx.problem.records)
+            .zip(simulated)
+        {
             let (own, power) = spectrum(e, ranges, 0..e.len())?;
             count += own;
-            whole.iter_mut().zip(power).for_each(|(sum, x)| *sum += x);
+            add(&mut whole, &power);
+            for distorted in distortions(&simulated).iter().filter(|d| !d.is_empty()) {
+                let whitened = record.whitened(distorted);
+                add(&mut response, &spectrum(&whitened, ranges, 0..e.len())?.1);
+            }
             for k in 0..PARTS_OF_RECORD {
                 let part = k * e.len() / PARTS_OF_RECORD..(k + 1) * e.len() / PARTS_OF_RECORD;
                 parts.push(spectrum(e, ranges, part)?);
@@ -131,13 +147,46 @@ impl Spectra {
         }
         Some(Self {
             step_hz,
+            apart: bins.div_ceil(rows),
+            records: fit.innovations.len() as f64,
             whole,
+            response,
             parts,
         })
     }
 
+    /// Power around a frequency, over that of white noise: the median on both sides.
+    fn background(&self, powers: &[f64], bin: usize) -> f64 {
+        let below = bin.saturating_sub(BESIDE * self.apart)..bin.saturating_sub(self.apart);
+        let above = bin + self.apart + 1..bin + BESIDE * self.apart + 1;
+        let mut beside: Vec<f64> = (below.chain(above).step_by(self.apart))
+            .filter_map(|bin| powers.get(bin).copied())
+            .collect();
+        if beside.is_empty() {
+            return 1.0;
+        }
+        let middle = beside.len() / 2;
+        let (_, median, _) = beside.select_nth_unstable_by(middle, f64::total_cmp);
+        // Of chi-square with two degrees of freedom a record (Wilson and Hilferty).
+        let white = 2.0 * self.records * (1.0 - 1.0 / (9.0 * self.records)).powi(3);
+        *median / white
+    }
+
+    /// Whether a line stands out of what is beside it, `least` times white noise. Innovations have more there where the noise is slow or a
+    /// response is missing. If the response or a distortion of it has a line there as well, its equation, which is not exactly nature's, may
+    /// leave a part of that.
+    fn stands_out(&self, bin: usize, least: f64) -> bool {
+        let (Some(itself), Some(response)) = (self.whole.get(bin), self.response.get(bin)) else {
+            return false;
+        };
+        let answers = *response > least * self.background(&self.response, bin);
+        *itself > least * self.background(&self.whole, bin).max(1.0)
+            && !(answers && *itself < MISFIT * response)
+    }
+
     /// The frequency, Hz, that gains most together with its multiples, `harmonics` in all. It has to stand out itself, because the halves
-    /// and thirds of a line have the line among their multiples; and in every part in which so much is expected.
+    /// and thirds of a line have the line among their multiples; and in every part in which so much is expected. The equation of the
+    /// response is not exactly nature's: what is small beside the response or its distortions is no line.
     fn strongest(&self, harmonics: usize, hz: Range<f64>) -> Option<f64> {
         // Fine enough for the highest multiple.
         let step_hz = self.step_hz / harmonics as f64;
@@ -152,7 +201,7 @@ impl Spectra {
                     expected < least || power[bin(m, 1)] > STOPPED * expected
                 })
             };
-            if itself < least || !lasts() {
+            if itself < least || !self.stands_out(bin(m, 1), least) || !lasts() {
                 return 0.0;
             }
             let powers = (1..=harmonics).filter_map(|times| self.whole.get(bin(m, times)));
@@ -162,6 +211,36 @@ impl Spectra {
         let (best, most) = gains.max_by(|a, b| a.1.total_cmp(&b.1))?;
         (most > 0.0).then_some(best as f64 * step_hz)
     }
+}
+
+/// Power that a wrong equation may leave of the response or of a distortion of it: equations are known to a tenth.
+const MISFIT: f64 = 0.01;
+/// Resolved frequencies on either side that are the background of a line.
+const BESIDE: usize = 10;
+/// A response, its size and the sign of its speed, of the same mean square: where it has a frequency, an equation that is not nature's leaves
+/// the even multiples of a bend and the odd ones of a play as well. None of a record that does not count.
+fn distortions(response_um: &[f64]) -> [Vec<f64>; 3] {
+    let centred = |x: Vec<f64>| {
+        let middle = x.iter().sum::<f64>() / x.len().max(1) as f64;
+        let off: Vec<f64> = x.iter().map(|y| y - middle).collect();
+        let squares: f64 = off.iter().map(|y| y * y).sum();
+        (off, squares)
+    };
+    let (response, squares) = centred(response_um.to_vec());
+    let size = response.iter().map(|y| y.abs()).collect();
+    let rises =
+        |k: usize| response[(k + 1).min(response.len() - 1)] - response[k.saturating_sub(1)];
+    let way = (0..response.len()).map(|k| rises(k).signum()).collect();
+    let scaled = |x| {
+        let (off, own) = centred(x);
+        let scale = if own > 0.0 {
+            (squares / own).sqrt()
+        } else {
+            0.0
+        };
+        off.into_iter().map(|y| scale * y).collect()
+    };
+    [scaled(size), scaled(way), response]
 }
 
 /// Parts of each record in which a line has to be. A misfit of the response is where the command moves. A pump or the mains do not stop

@@ -23,7 +23,10 @@ pub(crate) fn screen(
 ) -> Vec<Suspect> {
     let starting = |v: &Variant| allowed(*v) && v.candidate().role != Role::Position;
     let starting: Vec<Variant> = ctx.variants.iter().copied().filter(starting).collect();
-    let mut jobs: Vec<Part> = (starting.iter().flat_map(|v| v.starts(&ctx.scope))).collect();
+    // A line begins where it stands out.
+    let is_line = |v: &&Variant| matches!(v.candidate().role, Role::Line { .. });
+    let elsewhere = starting.iter().filter(|v| !is_line(v));
+    let mut jobs: Vec<Part> = elsewhere.flat_map(|v| v.starts(&ctx.scope)).collect();
     jobs.extend(line_starts(ctx, fit, &starting, mask));
     let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
     let scores = cellpos_numeric::parallel::map(&jobs, threads, |part| match part.variant().role {
