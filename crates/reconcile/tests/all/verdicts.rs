@@ -435,3 +435,24 @@ fn an_effect_from_elsewhere_is_searched_named_written_and_read_like_any_other() 
     let back = Model::from_toml_str(&text, "augmented.toml").unwrap();
     assert!(back.effect("square-drive").is_some());
 }
+
+#[test]
+#[ignore = "14 s of a release build: for .ci/nightly"]
+fn what_a_wrong_equation_leaves_at_the_multiples_of_a_drive_is_no_pump() {
+    let hidden = |size: f64, seed: u64| {
+        let u: Vec<f64> = (0..8000)
+            .map(|k| size * (TAU * 1.5 * f64::from(k) * 1e-3).sin())
+            .collect();
+        // Friction that eases the faster it goes: a stroke comes late and with a kink.
+        let rises = |k: usize| u[(k + 1).min(u.len() - 1)] - u[k];
+        let bent: Vec<f64> = (0..u.len())
+            .map(|k| u[k] - 0.08 * (rises(k) / (2e-3 + 0.3 * rises(k).abs())))
+            .collect();
+        let mut r = record("drive", &plant(), &bent, seed);
+        r.pzt_um.copy_from_slice(&u);
+        r
+    };
+    let records = [hidden(1.0, 1), hidden(0.5, 2), hidden(0.0, 3)];
+    let r = run(&plant(), &records);
+    assert!(!named(&r).contains(&"pump-pulsation"), "{:?}", r.effects);
+}
