@@ -1,6 +1,6 @@
 //! Moments of the area inside the contour, and their uncertainty.
 
-use super::{BORDER_PX, Contrast, Outline, Outliner, normals};
+use super::{BORDER_PX, Contrast, Outline, Outliner, normals, smear};
 
 /// Share of a disc's second moments that an outline's have at least.
 const LEAST_MOMENT: f64 = 0.05;
@@ -80,7 +80,7 @@ impl Outliner {
         }
         let area_px = bows * area;
         let (x_px, y_px) = (x0 + mx, y0 + my);
-        let mut information = [0.0; normals::WAYS + 1];
+        let mut information = [0.0; smear::WAYS + 1];
         for (known, profile) in information.iter_mut().zip(&self.smear.profiles) {
             *known = profile.information();
         }

@@ -10,6 +10,7 @@ mod contour;
 mod edge;
 mod measure;
 mod normals;
+mod smear;
 
 /// Most rays.
 pub(crate) const MAX_RAYS: usize = 128;
@@ -173,7 +174,7 @@ pub(crate) struct Outliner {
     hull: Vec<(f64, f64)>,
     sorted: Vec<(f64, f64)>,
     shapes: edge::Shapes,
-    smear: normals::Smear,
+    smear: smear::Smear,
     /// Blur of the frame, px.
     blur_px: f64,
 }
@@ -195,7 +196,7 @@ impl Outliner {
             hull: Vec::with_capacity(2 * MAX_RAYS + 2),
             sorted: Vec::with_capacity(MAX_RAYS),
             shapes: edge::Shapes::new(),
-            smear: normals::Smear::new(),
+            smear: smear::Smear::new(),
             blur_px: 0.0,
         }
     }
@@ -250,7 +251,6 @@ impl Outliner {
         self.find_normals();
         self.shift_outwards(edge.at_px);
         let residual = self.residual().max(noise * noise);
-        self.shift_by_smear();
         let edge_px = profile.edge_width_px();
         self.measure(contrast, residual, (edge.rim_grey, edge.halo_grey), edge_px)
     }

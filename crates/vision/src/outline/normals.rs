@@ -1,5 +1,6 @@
 //! Profiles along the contour's normals, and the mean one that they are fitted by.
 
+use super::smear::WAYS;
 use super::{Contrast, FINE_PX, MAX_FINE, Outliner};
 use nalgebra::{Matrix3, Vector3};
 
@@ -24,73 +25,6 @@ pub(super) struct Profile {
     pub(super) polarity: f64,
     /// Steps that the edge is wider on either side than rim and halo say: of a profile that is smeared.
     wider: usize,
-}
-
-/// Number of ways along a normal for a smeared cell.
-pub(super) const WAYS: usize = 8;
-/// A smear of a cell below this does not count, px: it widens an edge by a twelfth of its square.
-const LEAST_SMEAR_PX: f64 = 1.0;
-/// Rounds in which the mean profile is freed of the smear.
-const SHARPENED: usize = 6;
-/// Neighbours over which the contour's curvature is taken, points on either side.
-const CURVED: usize = 4;
-
-/// The mean profile as it is smeared along normals that make more or less of an angle with the motion.
-#[derive(Debug, Clone)]
-pub(super) struct Smear {
-    /// Way of the cell during the exposure, px.
-    pub(super) way_px: (f64, f64),
-    /// The mean profile along normals across the motion, smeared over none of the way up to all of it.
-    pub(super) profiles: Vec<Profile>,
-}
-
-impl Smear {
-    pub(super) fn new() -> Self {
-        Smear {
-            way_px: (0.0, 0.0),
-            profiles: Vec::with_capacity(WAYS + 1),
-        }
-    }
-
-    fn length_px(&self) -> f64 {
-        let length_px = f64::hypot(self.way_px.0, self.way_px.1);
-        // The comparison also refuses a NaN.
-        if length_px > LEAST_SMEAR_PX && length_px < MAX_FINE as f64 {
-            length_px
-        } else {
-            0.0
-        }
-    }
-
-    /// Standard deviation of the contour's shift by the smear of an object of a radius, px. The edge recedes by up to a 24th of
-    /// the squared way over the radius, which the model corrects to first order. As much again and half of it remains.
-    pub(super) fn left_px(&self, radius_px: f64) -> f64 {
-        self.length_px().powi(2) / (16.0 * radius_px.max(1.0))
-    }
-
-    /// Which of the profiles is that along a normal.
-    pub(super) fn which(&self, normal: &(f64, f64)) -> usize {
-        let length_px = self.length_px();
-        if length_px <= 0.0 {
-            return 0;
-        }
-        let along = (self.way_px.0 * normal.0 + self.way_px.1 * normal.1).abs();
-        ((along / length_px * WAYS as f64).round() as usize).min(WAYS)
-    }
-
-    /// Takes the mean profile for each angle.
-    fn spread(&mut self, profile: &Profile) {
-        let length_px = self.length_px();
-        self.profiles.clear();
-        self.profiles.push(*profile);
-        if length_px <= 0.0 {
-            return;
-        }
-        for k in 1..=WAYS {
-            let px = length_px * k as f64 / WAYS as f64;
-            self.profiles.push(profile.smeared(px));
-        }
-    }
 }
 
 impl Outliner {
@@ -146,69 +80,6 @@ impl Outliner {
             (*shift, *amplitude) = (found, a);
         }
         Some(profile)
-    }
-
-    /// The mean profile, into `smear` as it looks along each angle with the motion. Smeared, it leaves nothing of the normals'
-    /// profiles on average (Van Cittert's iteration, which few rounds keep smooth).
-    fn mean(&mut self, half: usize, polarity: f64) -> Profile {
-        let count = 2 * half + 1;
-        // Sums over the normals of each angle, and their numbers.
-        let mut sums = [[0.0; 2 * MAX_FINE + 1]; WAYS + 1];
-        let mut numbers = [0.0; WAYS + 1];
-        let rows = self.profiles.iter().zip(&self.normals);
-        for (row, normal) in rows.take(self.points.len()) {
-            let which = self.smear.which(normal);
-            for (sum, v) in sums[which].iter_mut().zip(row).take(count) {
-                *sum += f64::from(*v);
-            }
-            numbers[which] += 1.0;
-        }
-        let over = 1.0 / f64::max(numbers.iter().sum(), 1.0);
-        let mut values = [0.0; 2 * MAX_FINE + 1];
-        for sums in &sums {
-            for (value, sum) in values.iter_mut().zip(sums) {
-                *value += over * sum;
-            }
-        }
-        let mut profile = Profile::new(values, half, polarity, 0);
-        self.smear.spread(&profile);
-        if self.smear.profiles.len() <= 1 {
-            return profile;
-        }
-        for _ in 0..SHARPENED {
-            for ((sums, number), smeared) in sums.iter().zip(numbers).zip(&self.smear.profiles) {
-                for ((value, sum), own) in values.iter_mut().zip(sums).zip(&smeared.values) {
-                    *value += over * (sum - number * own);
-                }
-            }
-            profile = Profile::new(values, half, polarity, 0);
-            self.smear.spread(&profile);
-        }
-        profile
-    }
-
-    /// Moves the points out by the distance that a motion along the contour has taken: the edge of a round object recedes on
-    /// either side of the middle of the exposure.
-    pub(super) fn shift_by_smear(&mut self) {
-        let n = self.points.len();
-        if self.smear.length_px() <= 0.0 || n <= 2 * CURVED {
-            return;
-        }
-        let (x, y) = self.smear.way_px;
-        for i in 0..n {
-            let at = |k: usize| self.points[k % n];
-            let (a, b) = (at(i + n - CURVED), at(i + CURVED));
-            let normal = |k: usize| self.normals.get(k % n).copied().unwrap_or_default();
-            let (from, to) = (normal(i + n - CURVED), normal(i + CURVED));
-            let turned = f64::hypot(to.0 - from.0, to.1 - from.1);
-            let curvature = turned / f64::hypot(b.0 - a.0, b.1 - a.1).max(1.0);
-            let own = normal(i);
-            let along = x * own.1 - y * own.0;
-            if let Some(shift) = self.shifts.get_mut(i) {
-                *shift = along * along * curvature / 24.0;
-            }
-        }
-        self.shift_points();
     }
 
     /// Moves each point by its shift, smoothed with its neighbours', and says how far (RMS, px).
@@ -282,7 +153,12 @@ impl Outliner {
 }
 
 impl Profile {
-    fn new(values: [f64; 2 * MAX_FINE + 1], half: usize, polarity: f64, wider: usize) -> Self {
+    pub(super) fn new(
+        values: [f64; 2 * MAX_FINE + 1],
+        half: usize,
+        polarity: f64,
+        wider: usize,
+    ) -> Self {
         let mut slopes = [0.0; 2 * MAX_FINE + 1];
         for (k, slope) in slopes.iter_mut().enumerate().take(2 * half + 1) {
             let (a, b) = (k.saturating_sub(1), (k + 1).min(2 * half));
@@ -295,38 +171,6 @@ impl Profile {
             polarity,
             wider,
         }
-    }
-
-    /// The profile smeared over a way, px: its mean along the way. Beyond its ends it keeps the end values.
-    fn smeared(&self, px: f64) -> Self {
-        let count = 2 * self.half + 1;
-        let steps = px / FINE_PX;
-        // The integral at places between the steps.
-        let mut sums = [0.0; 2 * MAX_FINE + 2];
-        for k in 0..count {
-            sums[k + 1] = sums[k] + self.values[k];
-        }
-        let integral = |at: f64| {
-            let inside = at.clamp(0.0, count as f64);
-            let k = (inside as usize).min(count - 1);
-            let beyond = (at - inside) * self.values[if at < 0.0 { 0 } else { count - 1 }];
-            sums[k] + (inside - k as f64) * self.values[k] + beyond
-        };
-        let mut values = self.values;
-        if steps > 0.1 {
-            // A step's own width is a mean already.
-            let wide = f64::hypot(steps, 1.0);
-            for (k, value) in values.iter_mut().enumerate().take(count) {
-                let middle = k as f64 + 0.5;
-                *value = (integral(middle + 0.5 * wide) - integral(middle - 0.5 * wide)) / wide;
-            }
-        }
-        Profile::new(
-            values,
-            self.half,
-            self.polarity,
-            (0.5 * steps).ceil() as usize,
-        )
     }
 
     /// Width of the edge, from the rim to the halo, at least a pixel.

@@ -13,6 +13,7 @@ mod membranes;
 mod no_allocation;
 mod range;
 mod real_cells;
+mod smeared;
 mod streak;
 mod stress;
 mod stress_scene;
