@@ -53,6 +53,8 @@ pub(crate) struct Bead {
     pub at: Object,
     /// Contrast of its image, in those of the others.
     pub contrast: f64,
+    /// Whether the profile is learnt from it.
+    pub counts: bool,
     /// Places of the objects about it, px.
     others: Vec<(f64, f64)>,
 }
@@ -70,6 +72,7 @@ impl Bead {
         Bead {
             at: *at,
             contrast: 1.0,
+            counts: true,
             others: all[first..end].iter().filter(near).map(place).collect(),
         }
     }

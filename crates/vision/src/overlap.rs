@@ -86,6 +86,7 @@ pub(crate) fn learn(
     });
     let frames = beads.chunk_by(|a, b| a.at.frame == b.at.frame);
     let numbered = frames.flat_map(|frame| frame.iter().map(move |bead| (bead, frame)));
+    let numbered = numbered.filter(|(bead, _)| bead.counts);
     for (k, (bead, frame)) in numbered.enumerate() {
         add(&mut halves[k % 2], flats, (bead, frame), &prior, knots);
     }

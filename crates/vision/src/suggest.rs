@@ -344,7 +344,8 @@ fn learn(
     })
 }
 
-/// Fits the beads, each with the others of its frame; takes over their places and contrasts. The good fixes, with their frames.
+/// Fits the beads, each with the others of its frame; takes over their places and contrasts. The good fixes, with their frames. The
+/// next profile is learnt from the beads that have one: two beads in one region, or half of one, are another image at any place.
 fn fit(frames: &[Frame], beads: &mut [Bead], localiser: &mut Localiser) -> Vec<(usize, Fix)> {
     let mut fits = Vec::new();
     let mut found: Vec<Fix> = Vec::new();
@@ -375,8 +376,13 @@ fn fit(frames: &[Frame], beads: &mut [Bead], localiser: &mut Localiser) -> Vec<(
     } else {
         median(fits.iter().map(|(_, fix)| fix.amplitude.abs()))
     };
-    for bead in beads.iter_mut().filter(|bead| bead.contrast == 0.0) {
-        bead.contrast = usual;
+    let enough = fits.len() >= FEWEST;
+    for bead in beads.iter_mut() {
+        let is_fitted = bead.contrast > 0.0;
+        bead.counts = is_fitted || !enough;
+        if !is_fitted {
+            bead.contrast = usual;
+        }
     }
     fits
 }
@@ -406,7 +412,7 @@ fn collect(
     reach_px: f64,
 ) -> Box<Rings> {
     let mut rings = Box::new(Rings::new(reach_px));
-    for bead in beads {
+    for bead in beads.iter().filter(|bead| bead.counts) {
         let Some(pixels) = bead.pixels(flats, reach_px) else {
             continue;
         };

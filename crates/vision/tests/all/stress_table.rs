@@ -157,7 +157,12 @@ fn row(
             .collect();
         let frames: Vec<Frame> = pictures.iter().map(Picture::frame).collect();
         match suggest(&frames) {
-            Ok(found) => found.config,
+            Ok(found) => {
+                if std::env::var("STRESS_FIXES").is_ok() {
+                    println!("SETTINGS {found:?}");
+                }
+                found.config
+            }
             Err(error) => {
                 return (
                     format!("{name:14} SNR {snr:3} {settings:?} {spoil:?}: {error}"),
@@ -353,6 +358,17 @@ fn beads_of_a_few_pixels_are_found_in_pictures_of_a_codec() {
     let rows = [(40.0, Settings::Right), (200.0, Settings::Pasted)];
     let rows = rows.map(|(snr, settings)| (0, snr, settings, Spoil::Jpeg));
     run(&rows, 250.0);
+}
+
+#[test]
+fn a_profile_is_learnt_from_the_beads_that_it_fits() {
+    // Two beads in one region are as wide as one with its ring, and as many. Discs out of focus come in parts.
+    let rows = [
+        (8, Settings::Suggested, Spoil::Neighbours),
+        (7, Settings::Suggested, Spoil::Defocus(1.15)),
+    ];
+    let rows = rows.map(|(kind, settings, spoil)| (kind, 40.0, settings, spoil));
+    run(&rows, 60.0);
 }
 
 #[test]
