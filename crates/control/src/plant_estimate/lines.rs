@@ -297,10 +297,15 @@ impl Lines {
         let n = ERRORS * self.count;
         let [a, b, angle, drift] = std::array::from_fn(|i| ERRORS * k + i);
         let p = &mut self.covariance;
-        for j in 0..n {
-            p[a][j] -= im * p[angle][j];
-            p[b][j] += re * p[angle][j];
-            p[angle][j] += p[drift][j];
+        let (of_angle, of_drift) = (p[angle], p[drift]);
+        for (row, by, other) in [
+            (a, -im, &of_angle),
+            (b, re, &of_angle),
+            (angle, 1.0, &of_drift),
+        ] {
+            for (p, other) in p[row].iter_mut().zip(other).take(n) {
+                *p += by * other;
+            }
         }
         for row in &mut p[..n] {
             row[a] -= im * row[angle];
