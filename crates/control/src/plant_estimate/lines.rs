@@ -127,9 +127,11 @@ impl LineSettings {
     /// For a loop of this sample time, s, and `interval` ticks from fix to fix.
     pub(super) fn new(sample_s: f64, interval: f64) -> Self {
         let ticks = (SAMPLE_S / sample_s).max(interval).round().max(1.0);
-        let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s) as usize;
+        // A peak has a bin on either side.
+        let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s).ceil() as usize + 1;
         let beside = *BESIDE.end() + 1;
-        let bins = (highest + beside).min(BINS).min(WINDOW / 2) / AT_ONCE * AT_ONCE;
+        let bins = (highest + beside).next_multiple_of(AT_ONCE).min(BINS);
+        let bins = bins.min(WINDOW / 2) / AT_ONCE * AT_ONCE;
         let spectrum_s = (bins / AT_ONCE * (WINDOW / CHUNK + 1)) as f64 * sample_s;
         let looks = (CANDIDATE_S / spectrum_s * bins as f64).ln();
         Self {
