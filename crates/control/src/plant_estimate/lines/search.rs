@@ -7,13 +7,14 @@ use std::f64::consts::{LN_2, PI, TAU};
 /// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
 /// than half.
 pub(super) const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
-/// Part of a peak that a single steady tone may leave unexplained. A line at 100 Hz leaves 0.09 if it drifts by [`DRIFT_PER_S`], a tone that
+/// Part of a peak that a single steady tone may leave unexplained. A line at 100 Hz leaves 0.09 if it drifts by [`super::DRIFT_PER_S`], a tone that
 /// fills two thirds of the window 0.1, two tones 1 Hz apart that this window shows as one 0.65, and 0.00 if it shows both.
 const UNEXPLAINED: f64 = 0.1;
 /// Power that noise adds to that, over its mean in a bin: the tone is fitted to three bins, and 95 % of sums of two exponentials are less.
 const NOISE_LEFT: f64 = 4.744;
 /// Bins on either side within which a peak that is no tone pulls a tracker away: the main lobe's width.
 const PULLS: i64 = 4;
+
 /// Power over the median of `bins` bins of background that chance exceeds in one peak of `exp(looks)`.
 ///
 /// The power in a bin of noise is exponential. Under Hann's window its correlation with the next bin is 4/9 and with the second 1/36, so the
