@@ -15,27 +15,13 @@
 mod search;
 
 use super::whiten::Whitener;
-use search::{BESIDE, peak_over_median};
-use std::f64::consts::TAU;
+use search::{BINS, CANDIDATE_S, Search, SearchSettings, square, unit};
 
 /// Lines at once: a pump with five harmonics, the mains, and one more.
 const MOST: usize = 8;
-/// Highest frequency, Hz, and sampling interval of the spectrum, s (a slower camera has its own): two fifths of Nyquist's frequency.
-const HIGHEST_HZ: f64 = 200.0;
-const SAMPLE_S: f64 = 0.2 / HIGHEST_HZ;
-/// Samples of a spectrum, 2 s: resolves lines that are 1 Hz apart under Hann's window (main lobe of 4 bins).
-const WINDOW: usize = 2048;
-/// Samples that are kept: a window, and those that come while it is analysed.
-const KEPT: usize = 2 * WINDOW;
-const BINS: usize = (HIGHEST_HZ * SAMPLE_S * WINDOW as f64) as usize + *BESIDE.end() + 2 + AT_ONCE;
-/// Samples and bins that a tick analyses: a spectrum is complete after 0.93 s at 1 kHz.
-const CHUNK: usize = 128;
-const AT_ONCE: usize = 8;
 /// Bins within which two lines are one: less than half a main lobe.
 const ONE_LINE: f64 = 1.5;
-/// Mean time between two false candidates, s. They cost nothing: the fixes that follow confirm one candidate in a thousand. Mean time between
-/// two false positives, s, 28 hours.
-const CANDIDATE_S: f64 = 100.0;
+/// Mean time between two false positives, s: 28 hours.
 const FALSE_S: f64 = 1e5;
 /// Memory of amplitude and phase, s: a line that stops is gone in twice that time, and each line adds 0.7 % to the hold error at 1 kHz.
 const MEMORY_S: f64 = 1.0;
@@ -53,12 +39,9 @@ const STEADY_S: f64 = 450.0;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct LineSettings {
     sample_s: f64,
-    /// Ticks from fix to fix, and from sample to sample of the spectrum.
+    /// Ticks from fix to fix.
     interval: f64,
-    ticks: u32,
-    bins: usize,
-    /// Power of a peak over the median of its background that chance exceeds once in [`CANDIDATE_S`].
-    peak: f64,
+    search: SearchSettings,
     /// Square of the amplitude of a candidate over its variance that chance exceeds in one of `FALSE_S / CANDIDATE_S`.
     sure: f64,
 }
@@ -90,50 +73,20 @@ pub(super) struct Lines {
     count: usize,
     /// Covariance of the errors of all.
     covariance: [[f64; ALL_ERRORS]; ALL_ERRORS],
-    kept: [f32; KEPT],
-    /// Samples so far, and the one that is being made.
-    samples: usize,
-    sum: f64,
-    ticks: u32,
-    /// First sample of the window that is analysed; the bin and the sample that are next.
-    from: usize,
-    bin: usize,
-    at: usize,
-    filter: [[f64; 2]; AT_ONCE],
-    spectrum: [[f32; 2]; BINS],
-    judged: usize,
+    search: Search,
 }
 
 fn product(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
     [a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]]
 }
 
-fn square(a: [f64; 2]) -> f64 {
-    a[0] * a[0] + a[1] * a[1]
-}
-
-fn unit(angle: f64) -> [f64; 2] {
-    let (sin, cos) = angle.sin_cos();
-    [cos, sin]
-}
-
 impl LineSettings {
     /// For a loop of this sample time, s, and `interval` ticks from fix to fix.
     pub(super) fn new(sample_s: f64, interval: f64) -> Self {
-        let ticks = (SAMPLE_S / sample_s).max(interval).round().max(1.0);
-        // A peak has a bin on either side.
-        let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s).ceil() as usize + 1;
-        let beside = *BESIDE.end() + 1;
-        let bins = (highest + beside).next_multiple_of(AT_ONCE).min(BINS);
-        let bins = bins.min(WINDOW / 2) / AT_ONCE * AT_ONCE;
-        let spectrum_s = (bins / AT_ONCE * (WINDOW / CHUNK + 1)) as f64 * sample_s;
-        let looks = (CANDIDATE_S / spectrum_s * bins as f64).ln();
         Self {
             sample_s,
             interval,
-            ticks: ticks as u32,
-            bins,
-            peak: peak_over_median(2 * BESIDE.count(), looks),
+            search: SearchSettings::new(sample_s, interval),
             // The sum of two squares of a normal distribution.
             sure: 2.0 * (FALSE_S / CANDIDATE_S).ln(),
         }
@@ -143,9 +96,16 @@ impl LineSettings {
         self.interval * self.sample_s
     }
 
+    /// Whether a frequency in bins is that of a line.
+    fn is_known(&self, lines: &[Line], bin: f64) -> bool {
+        let turn = self.turn(bin);
+        let known = |line: &Line| (line.turn - turn).abs() < self.turn(ONE_LINE);
+        lines.iter().any(known)
+    }
+
     /// Angle in a tick of a frequency in bins, rad.
     fn turn(&self, bin: f64) -> f64 {
-        TAU * bin / (WINDOW as f64 * f64::from(self.ticks))
+        self.search.turn(bin)
     }
 }
 
@@ -163,16 +123,7 @@ impl Lines {
             lines: [Line::default(); MOST],
             count: 0,
             covariance: [[0.0; ALL_ERRORS]; ALL_ERRORS],
-            kept: [0.0; KEPT],
-            samples: 0,
-            sum: 0.0,
-            ticks: 0,
-            from: 0,
-            bin: 0,
-            at: WINDOW,
-            filter: [[0.0; 2]; AT_ONCE],
-            spectrum: [[0.0; 2]; BINS],
-            judged: BINS,
+            search: Search::new(),
         }
     }
 
@@ -196,13 +147,13 @@ impl Lines {
         for line in &mut self.lines[..self.count] {
             line.phase = product(line.phase, unit(line.turn));
         }
-        self.ticks += 1;
-        if self.ticks >= settings.ticks {
-            self.ticks = 0;
-            self.kept[self.samples % KEPT] = std::mem::take(&mut self.sum) as f32;
-            self.samples += 1;
-        }
-        self.search(settings);
+        let lines = &self.lines[..self.count];
+        let known = |bin: f64| settings.is_known(lines, bin);
+        let found = self.search.tick(&settings.search, known);
+        found
+            .into_iter()
+            .flatten()
+            .for_each(|bin| self.add(settings, bin));
     }
 
     /// A whitened fix of the disturbance that is `ago` ticks old, as if nothing were cancelled, and its variance without lines, um and um^2.
@@ -232,7 +183,7 @@ impl Lines {
             (shown[ERRORS * k], shown[ERRORS * k + 1]) = (seen[0], -seen[1]);
             left_um -= product(seen, line.amplitude)[0];
         }
-        self.sum += left_um;
+        self.search.take(left_um);
         self.correct(&shown, left_um, noise_um2, settings.interval);
         let mut k = 0;
         while k < self.count {
@@ -321,16 +272,10 @@ impl Lines {
         }
     }
 
-    fn is_known(&self, settings: &LineSettings, bin: f64) -> bool {
-        let turn = settings.turn(bin);
-        let known = |line: &Line| (line.turn - turn).abs() < settings.turn(ONE_LINE);
-        self.now().iter().any(known)
-    }
-
     /// A line of a frequency in bins, unless it is one that is known.
     fn add(&mut self, settings: &LineSettings, bin: f64) {
         let turn = settings.turn(bin);
-        if self.count < MOST && !self.is_known(settings, bin) {
+        if self.count < MOST && !settings.is_known(self.now(), bin) {
             self.lines[self.count] = Line {
                 phase: [1.0, 0.0],
                 turn,

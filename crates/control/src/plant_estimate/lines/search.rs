@@ -1,12 +1,25 @@
 //! The search for lines: a spectrum of what the lines leave, and its peaks that are one steady tone.
 
-use super::{AT_ONCE, BINS, CHUNK, KEPT, LineSettings, Lines, WINDOW, square, unit};
 use cellpos_numeric::statistics::invert;
 use std::f64::consts::{LN_2, PI, TAU};
 
+/// Highest frequency, Hz, and sampling interval of the spectrum, s (a slower camera has its own): two fifths of Nyquist's frequency.
+const HIGHEST_HZ: f64 = 200.0;
+const SAMPLE_S: f64 = 0.2 / HIGHEST_HZ;
+/// Samples of a spectrum, 2 s: resolves lines that are 1 Hz apart under Hann's window (main lobe of 4 bins).
+pub(super) const WINDOW: usize = 2048;
+/// Samples that are kept: a window, and those that come while it is analysed.
+const KEPT: usize = 2 * WINDOW;
+pub(super) const BINS: usize =
+    (HIGHEST_HZ * SAMPLE_S * WINDOW as f64) as usize + *BESIDE.end() + 2 + AT_ONCE;
+/// Samples and bins that a tick analyses: a spectrum is complete after 0.93 s at 1 kHz.
+const CHUNK: usize = 128;
+pub(super) const AT_ONCE: usize = 8;
+/// Mean time between two false candidates, s. They cost nothing: the fixes that follow confirm one in a thousand.
+pub(super) const CANDIDATE_S: f64 = 100.0;
 /// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
 /// than half.
-pub(super) const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
+const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
 /// Part of a peak that a single steady tone may leave unexplained. A line at 100 Hz leaves 0.09 if it drifts by [`super::DRIFT_PER_S`], a tone that
 /// fills two thirds of the window 0.1, two tones 1 Hz apart that this window shows as one 0.65, and 0.00 if it shows both.
 const UNEXPLAINED: f64 = 0.1;
@@ -19,7 +32,7 @@ const PULLS: i64 = 4;
 ///
 /// The power in a bin of noise is exponential. Under Hann's window its correlation with the next bin is 4/9 and with the second 1/36, so the
 /// bins are worth `many` independent ones. The smallest of `many` powers has a mean of `1/many`, the next one `1/(many - 1)` more.
-pub(super) fn peak_over_median(bins: usize, looks: f64) -> f64 {
+fn peak_over_median(bins: usize, looks: f64) -> f64 {
     let many = (bins as f64 / (1.0 + 8.0 / 9.0 + 2.0 / 36.0)).floor();
     let median = (many / 2.0).ceil() as usize;
     let logarithm = |x: f64| {
@@ -44,18 +57,110 @@ fn main_lobe(bins: f64) -> f64 {
     }
 }
 
-impl Lines {
-    /// A part of the search: of the transform, or of what is judged by it.
-    pub(super) fn search(&mut self, settings: &LineSettings) {
+pub(super) fn square(a: [f64; 2]) -> f64 {
+    a[0] * a[0] + a[1] * a[1]
+}
+
+pub(super) fn unit(angle: f64) -> [f64; 2] {
+    let (sin, cos) = angle.sin_cos();
+    [cos, sin]
+}
+
+/// Sampling of the spectrum, and what counts as a peak.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SearchSettings {
+    /// Ticks from sample to sample.
+    ticks: u32,
+    bins: usize,
+    /// Power of a peak over the median of its background that chance exceeds once in [`CANDIDATE_S`].
+    peak: f64,
+}
+
+impl SearchSettings {
+    /// For a loop of this sample time, s, and `interval` ticks from fix to fix.
+    pub(super) fn new(sample_s: f64, interval: f64) -> Self {
+        let ticks = (SAMPLE_S / sample_s).max(interval).round().max(1.0);
+        // A peak has a bin on either side.
+        let highest = (HIGHEST_HZ * WINDOW as f64 * ticks * sample_s).ceil() as usize + 1;
+        let beside = *BESIDE.end() + 1;
+        let bins = (highest + beside).next_multiple_of(AT_ONCE).min(BINS);
+        let bins = bins.min(WINDOW / 2) / AT_ONCE * AT_ONCE;
+        let spectrum_s = (bins / AT_ONCE * (WINDOW / CHUNK + 1)) as f64 * sample_s;
+        let looks = (CANDIDATE_S / spectrum_s * bins as f64).ln();
+        Self {
+            ticks: ticks as u32,
+            bins,
+            peak: peak_over_median(2 * BESIDE.count(), looks),
+        }
+    }
+
+    /// Angle in a tick of a frequency in bins, rad.
+    pub(super) fn turn(&self, bin: f64) -> f64 {
+        TAU * bin / (WINDOW as f64 * f64::from(self.ticks))
+    }
+}
+
+/// The samples, and how far their spectrum and its judgement are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Search {
+    kept: [f32; KEPT],
+    /// Samples so far, and the one that is being made.
+    samples: usize,
+    sum: f64,
+    ticks: u32,
+    /// First sample of the window that is analysed; the bin and the sample that are next.
+    from: usize,
+    bin: usize,
+    at: usize,
+    filter: [[f64; 2]; AT_ONCE],
+    spectrum: [[f32; 2]; BINS],
+    judged: usize,
+}
+
+impl Search {
+    pub(super) fn new() -> Self {
+        Self {
+            kept: [0.0; KEPT],
+            samples: 0,
+            sum: 0.0,
+            ticks: 0,
+            from: 0,
+            bin: 0,
+            at: WINDOW,
+            filter: [[0.0; 2]; AT_ONCE],
+            spectrum: [[0.0; 2]; BINS],
+            judged: BINS,
+        }
+    }
+
+    /// What the lines leave of a fix, um.
+    pub(super) fn take(&mut self, left_um: f64) {
+        self.sum += left_um;
+    }
+
+    /// A tick on: a part of the transform, or of what is judged by it. The frequencies of tones that were found, bins; `known` are those of
+    /// lines.
+    pub(super) fn tick(
+        &mut self,
+        settings: &SearchSettings,
+        known: impl Fn(f64) -> bool,
+    ) -> [Option<f64>; AT_ONCE] {
+        self.ticks += 1;
+        if self.ticks >= settings.ticks {
+            self.ticks = 0;
+            self.kept[self.samples % KEPT] = std::mem::take(&mut self.sum) as f32;
+            self.samples += 1;
+        }
         if self.judged < settings.bins {
-            self.judge(settings);
+            self.judge(settings, known)
         } else {
             self.transform(settings);
+            [None; AT_ONCE]
         }
     }
 
     /// Goertzel's filters of some bins on their way through the window.
-    fn transform(&mut self, settings: &LineSettings) {
+    fn transform(&mut self, settings: &SearchSettings) {
         if self.bin == 0 && self.at >= WINDOW {
             if self.samples < WINDOW {
                 return;
@@ -134,11 +239,16 @@ impl Lines {
         (side as f64 * off, left)
     }
 
-    /// Whether the next few bins hold lines.
-    fn judge(&mut self, settings: &LineSettings) {
+    /// The tones in the next few bins.
+    fn judge(
+        &mut self,
+        settings: &SearchSettings,
+        known: impl Fn(f64) -> bool,
+    ) -> [Option<f64>; AT_ONCE] {
+        let mut found = [None; AT_ONCE];
         let last = settings.bins - BESIDE.end() - 2;
         let (aside, width) = (*BESIDE.start() as i64, 2 * *BESIDE.end() as i64);
-        for bin in self.judged..self.judged + AT_ONCE {
+        for (bin, found) in (self.judged..).zip(&mut found) {
             if bin == 0 || bin >= last {
                 continue;
             }
@@ -168,18 +278,17 @@ impl Lines {
             let pulls = |other: i64| {
                 tone(other).is_some_and(|(power, at)| {
                     let is_large = power > UNEXPLAINED * own;
-                    is_large && at.is_none() && !self.is_known(settings, other as f64)
+                    is_large && at.is_none() && !known(other as f64)
                 })
             };
             let alone = (bin - PULLS..=bin + PULLS).all(|other| other == bin || !pulls(other));
             let at = tone(bin).and_then(|(_, at)| at);
-            if let Some(at) = at.filter(|_| alone && own > settings.peak * *median) {
-                self.add(settings, at);
-            }
+            *found = at.filter(|_| alone && own > settings.peak * *median);
         }
         self.judged += AT_ONCE;
         if self.judged >= settings.bins {
             self.judged = settings.bins.max(BINS);
         }
+        found
     }
 }
