@@ -91,19 +91,19 @@ impl Adapter {
         let usual_um2 = state.colour.usual_um2();
         let correction =
             (self.whitener).correction(state.covariance, apart, fix.variance_um2, usual_um2);
+        let shown_ago = delay + DELAYS[state.force.member] + ago;
+        let cancelled_um = state.cancelled.seen(shown_ago, self.exposure_ticks);
+        let cancelled_um = cancelled_um.unwrap_or(0.0);
         let series = (state.seen.as_mut())
             .zip(state.model.innovations(&correction, &at_um))
             .zip(state.instrument.innovations(&correction, &chosen_um));
         let Some(((seen, p), x)) = series else {
             state.seen = Some(Whitener::begin(fix.position_um));
-            state.cancelled_seen = Whitener::begin(0.0);
+            state.cancelled_seen = Whitener::begin(cancelled_um);
             state.model.begin(at_um);
             state.instrument.begin(chosen_um);
             return false;
         };
-        let shown_ago = delay + DELAYS[state.force.member] + ago;
-        let cancelled_um = state.cancelled.seen(shown_ago, self.exposure_ticks);
-        let cancelled_um = cancelled_um.unwrap_or(0.0);
         let cancelled = correction.innovation(&state.cancelled_seen, cancelled_um);
         correction.step(&mut state.cancelled_seen, cancelled);
         let y = correction.innovation(seen, fix.position_um);
