@@ -91,7 +91,8 @@ impl Adapter {
         let usual_um2 = state.colour.usual_um2();
         let correction =
             (self.whitener).correction(state.covariance, apart, fix.variance_um2, usual_um2);
-        let shown_ago = delay + DELAYS[state.force.member] + ago;
+        let late = DELAYS[state.force.member];
+        let shown_ago = delay + late + ago;
         let cancelled_um = state.cancelled.seen(shown_ago, self.exposure_ticks);
         let cancelled_um = cancelled_um.unwrap_or(0.0);
         let series = (state.seen.as_mut())
@@ -113,7 +114,7 @@ impl Adapter {
         state.covariance = correction.after;
         let scale = correction.weight;
         let (y, p, x) = (scale * y, p.map(|v| scale * v), x.map(|v| scale * v));
-        let (gain, late) = (state.force.log_gain.exp(), DELAYS[state.force.member]);
+        let gain = state.force.log_gain.exp();
         let in_force = dot(&p, &frame.of(late));
         state.now.add(y, in_force);
         let rise = (state.now.rise(gain, usual_um2)).min(MOST_CAUTION - state.force.log_gain);

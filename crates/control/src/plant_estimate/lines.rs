@@ -2,9 +2,9 @@
 //! in amplitude, phase and frequency, and cancelled by the command.
 //!
 //! Each line is an oscillator in the disturbance model. The fixes pass the filter of [`super::whiten`], which answers an oscillator `z` with
-//! `Re(S z)` plus white noise, where `S` is the response of that filter at the line's frequency. One Kalman filter of the amplitude, phase,
-//! frequency and drift of all lines follows from that. It sees the disturbance as it would be if nothing were cancelled, so what it corrects
-//! does not shake it. The command moves the bead against the lines through the inverse of the model. Estimator and regression leave
+//! `Re(S z)` plus white noise. `S` is the response of that filter at the line's frequency. One Kalman filter of the amplitude, phase,
+//! frequency and drift of all lines follows from that. It sees the disturbance as it would be if nothing were cancelled, so a correction does
+//! not shake it. The command moves the bead against the lines through the inverse of the model. Estimator and regression leave
 //! this part of the command out, because the disturbance cancels it.
 //!
 //! A line is tracked if its peak in a spectrum of what the lines leave exceeds the neighbouring bins and is one steady tone. It is
@@ -35,7 +35,7 @@ const GONE: f64 = 4.0;
 const DRIFT_PER_S: f64 = 0.01;
 const STEADY_S: f64 = 450.0;
 
-/// Sampling of the spectrum.
+/// What the lines take from the loop, and how sure they have to be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct LineSettings {
     sample_s: f64,

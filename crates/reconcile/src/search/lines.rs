@@ -61,6 +61,7 @@ pub(crate) fn line_starts(
     fit: &Fit,
     variants: &[Variant],
     mask: &Mask,
+    simulated: &[Vec<f64>],
 ) -> Vec<Part> {
     let of_line = |v: &Variant| match (v.candidate().role, v.candidate().params) {
         (Role::Line { harmonics }, [hz]) => Some((*v, harmonics, hz)),
@@ -73,7 +74,7 @@ pub(crate) fn line_starts(
     if lines.is_empty() {
         return Vec::new();
     }
-    let Some(spectra) = Spectra::of(ctx, fit, mask, highest_hz) else {
+    let Some(spectra) = Spectra::of(ctx, fit, mask, simulated, highest_hz) else {
         return Vec::new();
     };
     let start = |(variant, harmonics, hz): (Variant, usize, &FitParameter)| {
@@ -98,7 +99,13 @@ struct Spectra {
 }
 
 impl Spectra {
-    fn of(ctx: &Context<'_>, fit: &Fit, mask: &Mask, highest_hz: f64) -> Option<Self> {
+    fn of(
+        ctx: &Context<'_>,
+        fit: &Fit,
+        mask: &Mask,
+        simulated: &[Vec<f64>],
+        highest_hz: f64,
+    ) -> Option<Self> {
         let rows = fit.innovations.iter().map(Vec::len).max()?;
         let bins = (4 * rows).next_power_of_two();
         let step_hz = 1.0 / (bins as f64 * ctx.problem.base.sample_s);
@@ -125,7 +132,6 @@ impl Spectra {
         let add = |sum: &mut [f64], power: &[f64]| {
             sum.iter_mut().zip(power).for_each(|(sum, x)| *sum += x);
         };
-        let simulated = ctx.simulated(&fit.parts, fit.offset_um, mask);
         for (((e, ranges), record), simulated) in (fit.innovations.iter().zip(mask))
             .zip(&ctx.problem.records)
             .zip(simulated)
@@ -133,7 +139,7 @@ impl Spectra {
             let (own, power) = spectrum(e, ranges, 0..e.len())?;
             count += own;
             add(&mut whole, &power);
-            for distorted in distortions(&simulated).iter().filter(|d| !d.is_empty()) {
+            for distorted in distortions(simulated).iter().filter(|d| !d.is_empty()) {
                 let whitened = record.whitened(distorted);
                 add(&mut response, &spectrum(&whitened, ranges, 0..e.len())?.1);
             }
@@ -217,6 +223,7 @@ impl Spectra {
 const MISFIT: f64 = 0.01;
 /// Resolved frequencies on either side that are the background of a line.
 const BESIDE: usize = 10;
+
 /// A response, its size and the sign of its speed, of the same mean square: where it has a frequency, an equation that is not nature's leaves
 /// the even multiples of a bend and the odd ones of a play as well. None of a record that does not count.
 fn distortions(response_um: &[f64]) -> [Vec<f64>; 3] {
@@ -258,6 +265,8 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
     if highest_hz <= LOWEST_HZ {
         return None;
     }
-    let spectra = Spectra::of(ctx, fit, &ctx.problem.all(), highest_hz)?;
+    let all = ctx.problem.all();
+    let simulated = ctx.simulated(&fit.parts, fit.offset_um, &all);
+    let spectra = Spectra::of(ctx, fit, &all, &simulated, highest_hz)?;
     spectra.strongest(1, LOWEST_HZ..highest_hz)
 }

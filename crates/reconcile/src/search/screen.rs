@@ -27,8 +27,8 @@ pub(crate) fn screen(
     let is_line = |v: &&Variant| matches!(v.candidate().role, Role::Line { .. });
     let elsewhere = starting.iter().filter(|v| !is_line(v));
     let mut jobs: Vec<Part> = elsewhere.flat_map(|v| v.starts(&ctx.scope)).collect();
-    jobs.extend(line_starts(ctx, fit, &starting, mask));
     let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
+    jobs.extend(line_starts(ctx, fit, &starting, mask, &sim));
     let scores = cellpos_numeric::parallel::map(&jobs, threads, |part| match part.variant().role {
         Role::Line { .. } => lines_score(ctx, fit, part, mask),
         _ => {

@@ -20,7 +20,7 @@ pub(super) const CANDIDATE_S: f64 = 100.0;
 /// Bins on either side, beyond the main lobe. The median of all is the background: 11 Hz, of which the harmonics of a pump of 3 Hz fill less
 /// than half.
 const BESIDE: std::ops::RangeInclusive<usize> = 3..=22;
-/// Part of a peak that a single steady tone may leave unexplained. A line at 100 Hz leaves 0.09 if it drifts by [`super::DRIFT_PER_S`], a tone that
+/// Part of a peak that a single steady tone may leave unexplained. A line at 100 Hz that drifts by 1 % a second leaves 0.09. A tone that
 /// fills two thirds of the window 0.1, two tones 1 Hz apart that this window shows as one 0.65, and 0.00 if it shows both.
 const UNEXPLAINED: f64 = 0.1;
 /// Power that noise adds to that, over its mean in a bin: the tone is fitted to three bins, and 95 % of sums of two exponentials are less.
@@ -266,6 +266,9 @@ impl Search {
                 count += 1;
             }
             let (_, median, _) = beside[..count].select_nth_unstable_by(count / 2, f64::total_cmp);
+            if own <= settings.peak * *median {
+                continue;
+            }
             // Powers of noise are exponential: their mean is the median over ln 2.
             let noise = NOISE_LEFT * *median / LN_2;
             let tone = |bin: i64| {
@@ -283,7 +286,7 @@ impl Search {
             };
             let alone = (bin - PULLS..=bin + PULLS).all(|other| other == bin || !pulls(other));
             let at = tone(bin).and_then(|(_, at)| at);
-            *found = at.filter(|_| alone && own > settings.peak * *median);
+            *found = at.filter(|_| alone);
         }
         self.judged += AT_ONCE;
         if self.judged >= settings.bins {
