@@ -2,6 +2,7 @@
 
 pub(crate) mod cost;
 pub(crate) mod effort;
+pub(crate) mod found;
 pub(crate) mod lines;
 mod pixel;
 mod screen;

@@ -8,32 +8,9 @@ use crate::search::cost::{
     before_forms, gap, least_gain, leaves_much, left_over, penalised_cost, threshold_of,
 };
 use crate::search::effort::Effort;
+use crate::search::found::{Found, Rival};
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
-
-/// A set with the rivals met on the way.
-#[derive(Debug, Clone)]
-pub(crate) struct Found {
-    pub fit: Fit,
-    pub null: Fit,
-    /// Sum of squares after each step, with the set of that step.
-    pub steps: Vec<(Vec<&'static str>, f64)>,
-    /// For each effect of the set: rivals in its stead, id and sum of squares of the joint refit. Shorter than the set: they were not
-    /// weighed.
-    pub rivals: Vec<Vec<Rival>>,
-    /// The search ended because its work was done up, not because nothing more was to be found.
-    pub cut_short: bool,
-}
-
-/// Another candidate in place of a named one.
-#[derive(Debug, Clone)]
-pub(crate) struct Rival {
-    pub id: &'static str,
-    pub chi2: f64,
-    pub part: Part,
-    /// Whether one of its numbers is at the end of its range, or may have any value in it.
-    pub is_limit: bool,
-}
 
 /// Sums of squares this far above that of a fit decide nothing, whatever their prices.
 fn within(fit: &Fit) -> f64 {

@@ -5,7 +5,7 @@ use crate::data::frames::FrameCounts;
 use crate::data::record::Record;
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
-use crate::search::sequential::Found;
+use crate::search::found::Found;
 use crate::units::figure;
 use crate::verdict::augment::augment;
 use crate::verdict::form::Aside;

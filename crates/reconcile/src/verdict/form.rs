@@ -11,7 +11,7 @@ use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::linear::Columns;
 use crate::search::cost::{gap, penalised_cost, prior_penalty, threshold};
-use crate::search::sequential::Found;
+use crate::search::found::Found;
 use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
@@ -73,12 +73,8 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
         aside
             .companions
             .push((found.fit.parts[i].id().to_owned(), worth[i].min(1.0)));
-        let smaller = without[i].clone();
-        let whole = std::mem::replace(&mut found.fit, smaller);
-        aside.whole.get_or_insert(whole);
-        if i < found.rivals.len() {
-            found.rivals.remove(i);
-        }
+        aside.whole.get_or_insert_with(|| found.fit.clone());
+        found.lose(ctx, i, without[i].clone(), threads);
     }
     aside
 }
@@ -124,7 +120,10 @@ fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: us
     };
     let one = &alone[best];
     let gained = one.chi2 - found.fit.chi2;
-    if gained > THRESHOLDS.companion_share * gap || gain_of_freer(ctx, one, &[0]) < gained {
+    if gained > THRESHOLDS.companion_share * gap
+        || gain_of_freer(ctx, one, &[0]) < gained
+        || gain_of_freer(ctx, &found.fit, &[best]) < THRESHOLDS.companion_rest * gained
+    {
         return;
     }
     let others = found.fit.parts.iter().enumerate();
@@ -133,8 +132,8 @@ fn one_form(ctx: &Context<'_>, found: &mut Found, aside: &mut Aside, threads: us
         .map(|(_, part)| part.id())
         .collect();
     aside.companions.push((others.join(" and "), gained / gap));
-    found.rivals = found.rivals.get(best).cloned().into_iter().collect();
-    aside.whole = Some(std::mem::replace(&mut found.fit, one.clone()));
+    aside.whole = Some(found.fit.clone());
+    found.keep(ctx, &[best], one.clone(), threads);
 }
 
 /// Whether a part is one whose share of the response another effect's form may take.
@@ -179,12 +178,12 @@ pub(crate) struct WithoutMemory {
 
 impl WithoutMemory {
     pub(crate) fn beside(ctx: &Context<'_>, set: &Fit) -> Self {
-        // A curve that bends where the range begins is a gain.
-        let curve = bends(ctx, set, &[&[0.0], &KNOTS[..]].concat());
+        let curve = curve(ctx, set);
         let gain = curve.iter().map(|columns| columns[..1].to_vec()).collect();
+        let beside = gained_beside(ctx, set, curve);
         Self {
             by_a_gain: gained_beside(ctx, set, gain),
-            by_a_curve: gained_beside(ctx, set, curve),
+            by_a_curve: instead_of_curves(ctx, set).map_or(beside, |by| by.max(beside)),
             records: ctx.problem.records.len(),
         }
     }
@@ -202,6 +201,18 @@ impl WithoutMemory {
             || self.beyond_a_gain(self.by_a_curve)
                 > THRESHOLDS.curve_share * self.beyond_a_gain(gained)
     }
+}
+
+/// The gain of a set if one curve takes the place of all curves in it; None if it has none. Where a curve of the set is flat, such
+/// as beyond a saturation, no bend in front of it shows.
+fn instead_of_curves(ctx: &Context<'_>, set: &Fit) -> Option<f64> {
+    let bent = set.parts.iter().filter(|p| !p.variant.is_curve());
+    let bent: Vec<Part> = bent.cloned().collect();
+    if bent.len() == set.parts.len() {
+        return None;
+    }
+    let bare = ctx.fit_from(bent, Some(set.soft), &ctx.problem.all(), ROUNDS);
+    Some(gained_beside(ctx, &bare, curve(ctx, &bare)) - (bare.chi2 - set.chi2))
 }
 
 /// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.
@@ -272,8 +283,13 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
     out
 }
 
-/// Places in the command's range, as shares of it, at which a curve may bend; one that bends where the range begins is a gain.
+/// Places in the command's range, as shares of it, at which a curve may bend.
 const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
+
+/// Innovations by record and column of any curve in front of a set. The bend where the range begins is a gain.
+fn curve(ctx: &Context<'_>, fit: &Fit) -> Vec<Vec<Vec<f64>>> {
+    bends(ctx, fit, &[&[0.0], &KNOTS[..]].concat())
+}
 
 /// Innovations by record and column of a curve in front of a set that bends at these places of the command's range.
 fn bends(ctx: &Context<'_>, fit: &Fit, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {

@@ -55,11 +55,11 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let scatter = scatter(n);
     let excess = e.null.chi2 + e.null.absorbed - n;
     let left = e.fit.chi2 - n;
-    let closed = if excess > 0.0 {
-        1.0 - left.max(0.0) / excess
-    } else {
-        1.0
+    let closed_by = |fit: &Fit| match excess > 0.0 {
+        true => 1.0 - (fit.chi2 - n).max(0.0) / excess,
+        false => 1.0,
     };
+    let closed = closed_by(e.fit);
     let all = ctx.problem.all();
     let library = battery::library(ctx, e.fit);
     let strongest = battery::strongest(&library, &ctx.tangents(e.fit, &all), e.fit, &all);
@@ -69,7 +69,8 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
     let much = leaves_much(e.null, e.fit);
     let beyond_chance = much || term.is_some();
-    let remains = beyond_chance || !e.aside.companions.is_empty();
+    let mut companions = e.aside.companions.iter();
+    let remains = beyond_chance || companions.any(|(_, share)| *share > THRESHOLDS.term_share);
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
         reasons: Vec::new(),
@@ -106,7 +107,8 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         (false, true) => THRESHOLDS.closed_whole,
         (false, false) => THRESHOLDS.remainder_closed,
     };
-    if beyond_chance && closed < least {
+    // What was set aside is another form of what is named.
+    if beyond_chance && closed.max(closed_by(whole)) < least {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",

@@ -4,7 +4,7 @@ use crate::data::frames::{self, FrameCounts};
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
-use crate::search::sequential::Rival;
+use crate::search::found::Rival;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::form::WithoutMemory;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};

@@ -9,7 +9,8 @@
 use crate::fit::context::{Context, Fit};
 use crate::search::cost::{before_forms, penalised_cost, prior_penalty, threshold};
 use crate::search::effort::Effort;
-use crate::search::sequential::{FREELY, Found, extensions, ids, settle};
+use crate::search::found::Found;
+use crate::search::sequential::{FREELY, extensions, ids, settle};
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::{form, held_out, judge, split};
 

@@ -13,7 +13,8 @@ use crate::model_error;
 use crate::problem::{Errors, Problem};
 use crate::search::cost::{gap, left_over};
 use crate::search::effort::Effort;
-use crate::search::sequential::{Found, ids, settle};
+use crate::search::found::Found;
+use crate::search::sequential::{ids, settle};
 use crate::simulate::{Base, Zpk};
 use crate::thresholds::THRESHOLDS;
 use crate::units::{Scales, Units};
@@ -235,10 +236,8 @@ fn confirmed(
         ));
         let mut parts = found.fit.parts.clone();
         parts.remove(i);
-        if i < found.rivals.len() {
-            found.rivals.remove(i);
-        }
-        found.fit = ctx.fit(parts, &ctx.problem.all(), 12);
+        let without = ctx.fit(parts, &ctx.problem.all(), 12);
+        found.lose(ctx, i, without, threads);
         held = held_out::check(ctx, &found.fit, threads);
     }
     held
@@ -302,12 +301,12 @@ fn explains_something(found: &mut Found) {
 
 /// Removes effects that are too small or at a bound.
 fn take_back(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
-    drop_small(ctx, found);
+    drop_small(ctx, found, effort.threads);
     drop_bound(ctx, found, effort);
 }
 
 /// Removes effects too small to matter if others explain the rest.
-fn drop_small(ctx: &Context<'_>, found: &mut Found) {
+fn drop_small(ctx: &Context<'_>, found: &mut Found, threads: usize) {
     let all = ctx.problem.all();
     let mut i = 0;
     while i < found.fit.parts.len() {
@@ -323,10 +322,7 @@ fn drop_small(ctx: &Context<'_>, found: &mut Found) {
             i += 1;
             continue;
         }
-        if i < found.rivals.len() {
-            found.rivals.remove(i);
-        }
-        found.fit = without;
+        found.lose(ctx, i, without, threads);
     }
 }
 
