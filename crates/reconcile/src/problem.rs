@@ -5,7 +5,7 @@ use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
 use crate::data::noise::{NoiseModel, Whitener};
 use crate::data::record::{Record, command_range_um};
-use crate::data::uncertain::uncertain_command;
+use crate::data::uncertain::{anywhere_at, uncertain_command};
 use crate::data::waits::waits;
 use crate::dot::dot;
 use crate::model_error::STEP;
@@ -380,6 +380,15 @@ impl Problem {
         self.noise = noise;
         for r in &mut self.records {
             r.set_noise(&noise);
+        }
+        self
+    }
+
+    /// The same problem with positions that are anywhere from some rows of each record on.
+    pub(crate) fn open_at(mut self, rows: impl Fn(usize) -> Vec<usize>) -> Self {
+        for (i, r) in self.records.iter_mut().enumerate() {
+            r.extra_walk = Some(anywhere_at(&rows(i), &r.y, r.extra_walk.take()));
+            r.set_noise(&self.noise);
         }
         self
     }

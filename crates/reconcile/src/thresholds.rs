@@ -26,7 +26,6 @@ pub struct Thresholds {
     /// `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
     pub tie: f64,
     /// A set that closes less than this part of the excess over the floor is no explanation.
-    /// Pinned by `jumps_of_the_bead_are_unknown_and_it_says_where`.
     pub closed_least: f64,
     /// A set that closes less than this leaves a remainder; the verdict names it if the rest is beyond chance.
     pub closed_whole: f64,
@@ -86,7 +85,7 @@ pub struct Thresholds {
     /// A fit that leaves more than this per row is rough: what rivals differ by in their last percent decides nothing.
     pub rough: f64,
     /// A single row is a jump beyond this number of standard deviations. Pinned by
-    /// `jumps_of_the_bead_are_unknown_and_it_says_where`.
+    /// `jumps_of_the_bead_are_named_with_rate_and_size_alone_and_beside_another_effect`.
     pub jump_sd: f64,
     /// Least gain in twice the log-likelihood of a term in a formula of the residual.
     pub term_worth: f64,

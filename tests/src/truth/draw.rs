@@ -206,7 +206,6 @@ pub fn strangers(seed: u64) -> Vec<Case> {
         H::Spring(0.0005 * factor()),
         H::Echo(0.3 * factor(), 0.02 * factor()),
         H::Distortion(0.003 * factor()),
-        H::Jumps(1.5 * factor()),
     ];
     all.extend(Stranger::ALL.map(|s| H::Stranger(s.times(factor()))));
     all.into_iter()

@@ -33,6 +33,8 @@ pub enum Hidden {
     Stiffening(f64),
     /// A mode of the camera's stand that the PZT's motion excites: Hz, damping, share.
     Shake(f64, f64, f64),
+    /// The bead jumps by c um every 997 ms.
+    Jumps(f64),
     /// Another equation of an effect of the catalogue.
     Second(Second),
     // Not in the catalogue:
@@ -56,8 +58,6 @@ pub enum Hidden {
     Valve(f64),
     /// The camera's image is curved: y + c y^2.
     Distortion(f64),
-    /// Flow noise in steps: the bead jumps by c um, once a second.
-    Jumps(f64),
 }
 
 impl Hidden {
@@ -73,6 +73,7 @@ impl Hidden {
             Self::Bubble(tau) => vec![("lag_s", tau)],
             Self::Leak(w) => vec![("corner_rad_per_s", w)],
             Self::Gain(f) => vec![("factor", f)],
+            Self::Jumps(um) => vec![("per_s", 1.0 / 0.997), ("um", um)],
             Self::GainDrift(r) => vec![("per_s", r)],
             Self::Adhesion(v) => vec![("speed_um_per_s", v)],
             Self::FlowDrift(v) => vec![("um_per_s", v)],
@@ -122,6 +123,7 @@ impl Hidden {
             Self::Shake(..) => "camera-shake",
             Self::Second(second) => second.id(),
             Self::Valve(_) => "valve-asymmetry",
+            Self::Jumps(_) => "jumps",
             _ => "outside",
         }
     }

@@ -19,15 +19,28 @@ fn run(records: &[Record]) -> Result<Reconciliation, ReconcileError> {
 
 #[test]
 #[ignore = "long: run with --release -- --include-ignored"]
-fn jumps_of_the_bead_are_unknown_and_it_says_where() {
-    let result = run(&hiding(Hidden::Jumps(1.5), 11)).unwrap();
-    assert_eq!(result.verdict, Verdict::Unknown);
-    assert!(result.effects.is_empty());
-    assert!(
-        result.places.iter().any(|p| p.contains("in single rows")),
-        "{:?}",
-        result.places
-    );
+fn jumps_of_the_bead_are_named_with_rate_and_size_alone_and_beside_another_effect() {
+    let model_effects = Model::eq6().effects.len();
+    for (beside, seed) in [(None, 11), (Some(Hidden::Delay(2e-3)), 12)] {
+        let hidden = Hidden::Jumps(1.5);
+        let all: Vec<Hidden> = std::iter::once(hidden).chain(beside).collect();
+        let case = Case::new("jumps", all.clone(), Session::STANDARD);
+        let result = run(&records(&case, seed)).unwrap();
+        assert_eq!(result.verdict, Verdict::Named, "{:?}", result.places);
+        let sorted = |mut ids: Vec<String>| {
+            ids.sort_unstable();
+            ids
+        };
+        let named = result.effects.iter().map(|e| e.id.clone()).collect();
+        let truth = all.iter().map(|h| h.id().to_owned()).collect();
+        assert_eq!(sorted(named), sorted(truth));
+        let jumps = result.effects.iter().find(|e| e.id == "jumps").unwrap();
+        for (name, truth) in hidden.parameters() {
+            let [low, high] = jumps.parameters[name].ci95;
+            assert!(low <= truth && truth <= high, "{name}: {low} to {high}");
+        }
+        assert_eq!(result.augmented.effects.len(), model_effects + all.len());
+    }
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Commands that are not known: rows that were missing, and stalls.
+//! Motion that is not known: by commands in rows that were missing and in stalls, and by jumps.
 
 use crate::data::record::Record;
 
@@ -14,6 +14,17 @@ pub(crate) fn uncertain_command(r: &Record, gain_per_sample: f64) -> Option<Vec<
     }
     add_late(r, gain_per_sample, &mut extra);
     Some(extra)
+}
+
+/// Adds that the bead may have gone anywhere in these rows: as far as it went in the whole record.
+pub(crate) fn anywhere_at(rows: &[usize], bead_um: &[f64], extra: Option<Vec<f64>>) -> Vec<f64> {
+    let ends = (f64::INFINITY, f64::NEG_INFINITY);
+    let (low, high) = (bead_um.iter()).fold(ends, |(a, b), um| (a.min(*um), b.max(*um)));
+    let mut extra = extra.unwrap_or_else(|| vec![0.0; bead_um.len()]);
+    for row in rows.iter().filter(|row| **row < bead_um.len()) {
+        extra[*row] = (high - low).powi(2);
+    }
+    extra
 }
 
 /// Where rows were missing their command is a guess.

@@ -5,14 +5,17 @@ use crate::data::frames::FrameCounts;
 use crate::data::record::Record;
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
+use crate::search::cost::left_over;
 use crate::search::found::Found;
 use crate::units::figure;
 use crate::verdict::augment::augment;
+use crate::verdict::counted::Counted;
 use crate::verdict::form::Aside;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge::{Evidence, judge};
+use crate::verdict::jumps::Jumps;
 use crate::verdict::map;
-use crate::verdict::names::{names, of_frames};
+use crate::verdict::names::names;
 use crate::verdict::proposal;
 use crate::verdict::result::{Gap, GapStep, Interval, Reconciliation, Traces, Verdict};
 use crate::verdict::sentences::sentences;
@@ -24,6 +27,7 @@ pub(crate) struct Given<'a> {
     pub model: &'a Model,
     pub records: &'a [Record],
     pub frames: &'a FrameCounts,
+    pub jumps: Option<&'a Jumps>,
     pub floor: &'a Floor,
     pub threads: usize,
     /// What is to be said where the records hardly go with the model.
@@ -42,6 +46,7 @@ pub(crate) fn assemble(
         model,
         records,
         frames,
+        jumps,
         floor,
         threads,
         unlike,
@@ -59,7 +64,7 @@ pub(crate) fn assemble(
     let mut places: Vec<String> = unlike.map(str::to_owned).into_iter().collect();
     places.extend(sentences(ctx, &null, &null_map, floor.source.is_known()));
     let names = names(ctx, &null, &fit, &rivals, threads);
-    let (counted, counted_places) = of_frames(frames);
+    let counted = Counted::new(ctx, frames, jumps, left_over(&null));
     let gap = gap(ctx, &held, [&null, &fit], &steps, [&null_map, &after_map]);
     let judgement = judge(
         ctx,
@@ -72,7 +77,7 @@ pub(crate) fn assemble(
             floor,
             null_flagged: null_map.any_flagged(),
             after: &after_map,
-            counted: !counted.is_empty(),
+            counted: !counted.named.is_empty(),
             cut_short,
             unweighed: rivals.len() < fit.parts.len(),
             unlike,
@@ -81,7 +86,7 @@ pub(crate) fn assemble(
         threads,
     );
     let verdict = judgement.verdict;
-    places.extend(counted_places);
+    places.extend(counted.places);
     places.extend(judgement.reasons);
     places.extend(slow_noise(ctx).or_else(|| zero_flow(ctx)));
     if cut_short {
@@ -91,7 +96,7 @@ pub(crate) fn assemble(
         Vec::new()
     } else {
         let mut effects = names.effects;
-        effects.extend(counted);
+        effects.extend(counted.named);
         effects.sort_by(|a, b| {
             b.explained
                 .total_cmp(&a.explained)
@@ -99,17 +104,13 @@ pub(crate) fn assemble(
         });
         effects
     };
-    let augmented = augment(model, ctx, &fit, frames, &named, verdict, floor);
+    let with = |verdict| {
+        let counted = &counted.of_model;
+        augment(model, ctx, &fit, counted, &named, verdict, floor)
+    };
+    let augmented = with(verdict);
     // The same with the set that was best, whether or not it earned its names.
-    let mut best = augment(
-        model,
-        ctx,
-        &fit,
-        frames,
-        &named,
-        Verdict::NamedWithRemainder,
-        floor,
-    );
+    let mut best = with(Verdict::NamedWithRemainder);
     best.provenance
         .insert("reconcile.verdict".to_owned(), verdict.word().to_owned());
     let traces = Traces::new(ctx, &null, &fit);

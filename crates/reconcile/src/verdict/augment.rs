@@ -1,12 +1,11 @@
 //! What was found, as a model.
 
 use crate::data::floor::Floor;
-use crate::data::frames::FrameCounts;
 use crate::fit::context::{Context, Fit};
 use crate::simulate::near_whole;
 use crate::units::figure;
 use crate::verdict::result::{Effect as NamedEffect, Verdict};
-use cellpos_plant::effects::{self, Action, Role};
+use cellpos_plant::effects::{Action, Role};
 use cellpos_plant::{Effect, Model};
 
 /// Key of the provenance of a model whose noise has a part that `[noise]` has no word for.
@@ -96,7 +95,7 @@ pub(crate) fn augment(
     model: &Model,
     ctx: &Context<'_>,
     fit: &Fit,
-    frames: &FrameCounts,
+    counted: &[Effect],
     named: &[NamedEffect],
     verdict: Verdict,
     floor: &Floor,
@@ -145,12 +144,8 @@ pub(crate) fn augment(
                 add(&mut out.effects, ctx.scales.effect_out(&e));
             }
         }
-        if frames.drops_named() {
-            out.effects.push(effects::frame_drops(frames.drop_rate()));
-        }
-        if frames.repeats_named() {
-            out.effects
-                .push(effects::frame_repeats(frames.repeat_rate()));
+        for e in counted {
+            out.effects.push(ctx.scales.effect_out(e));
         }
         for e in named {
             for (name, p) in e
@@ -182,6 +177,7 @@ pub(crate) fn augment(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cellpos_plant::effects;
 
     #[test]
     fn a_delay_found_beside_a_delay_is_added_to_it() {

@@ -3,11 +3,13 @@
 mod assemble;
 mod augment;
 pub(crate) mod battery;
+mod counted;
 mod form;
 pub(crate) mod guard;
 mod held_out;
 mod hidden;
 pub(crate) mod judge;
+mod jumps;
 pub(crate) mod map;
 mod names;
 mod parameters;

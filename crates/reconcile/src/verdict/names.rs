@@ -1,6 +1,5 @@
 //! The effects of a set as results: numbers with intervals, rivals, and what would tell them apart.
 
-use crate::data::frames::{self, FrameCounts};
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
@@ -9,13 +8,12 @@ use crate::thresholds::THRESHOLDS;
 use crate::verdict::form::WithoutMemory;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};
 use crate::verdict::profile;
-use crate::verdict::result::{Effect as NamedEffect, Interval};
+use crate::verdict::result::Effect as NamedEffect;
 use crate::verdict::shapes;
 use crate::verdict::significance;
 use crate::verdict::split;
 use cellpos_plant::effects;
 use std::cell::LazyCell;
-use std::collections::BTreeMap;
 
 /// Whether no record of command and bead position can tell two effects apart.
 fn inseparable(a: &str, b: &str) -> bool {
@@ -183,58 +181,6 @@ pub(crate) fn names(
     }
     shapes::reach(ctx, fit, &sure.wide, &mut out.effects, threads);
     out
-}
-
-/// Missing and repeated frames, counted, and where.
-pub(crate) fn of_frames(frames: &FrameCounts) -> (Vec<NamedEffect>, Vec<String>) {
-    let (mut named, mut places) = (Vec::new(), Vec::new());
-    let rows = [
-        (
-            effects::frame_drops(0.0).id(),
-            frames.drops_named(),
-            frames.missing,
-            frames.rows,
-            frames.drop_rate(),
-            0.0,
-        ),
-        (
-            effects::frame_repeats(0.0).id(),
-            frames.repeats_named(),
-            frames.repeats,
-            frames.pairs,
-            frames.repeat_rate(),
-            frames.by_chance,
-        ),
-    ];
-    for (id, is_named, count, total, rate, chance) in rows {
-        if !is_named {
-            continue;
-        }
-        let wide = frames::wilson(count as f64, total.max(1) as f64);
-        let off = chance / total.max(1) as f64;
-        named.push(NamedEffect {
-            id: id.to_owned(),
-            place: "camera",
-            parameters: BTreeMap::from([(
-                "rate".to_owned(),
-                Interval {
-                    value: rate,
-                    ci95: [(wide[0] - off).max(0.0), (wide[1] - off).max(0.0)],
-                    unit: String::new(),
-                },
-            )]),
-            p_value: significance::p_value(2.0 * (count as f64 - chance), 1),
-            explained: 0.0,
-            alternatives: Vec::new(),
-            separate_by: None,
-        });
-        places.push(format!("{id}: {count} of {total} frames"));
-    }
-    let missing = frames.missing;
-    if !frames.of_camera && missing > 0 {
-        places.push(format!("{missing} of {} rows have no output", frames.rows));
-    }
-    (named, places)
 }
 
 fn is_of_plays(part: &Part) -> bool {

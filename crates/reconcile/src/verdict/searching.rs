@@ -13,6 +13,7 @@ use crate::search::found::Found;
 use crate::search::sequential::search;
 use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::units::Scales;
+use crate::verdict::jumps::Jumps;
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
@@ -121,6 +122,44 @@ impl Searching<'_> {
             problem = problem.with_noise(next);
             start = Some(found.fit);
         }
+    }
+
+    /// Searches, and once more with the position open where it jumps: the jumps of a bead, if there are any.
+    pub(super) fn beside_jumps(
+        &self,
+        problem: Problem,
+        floor: &Floor,
+        effort: Effort,
+        progress: &mut dyn FnMut(&str),
+    ) -> (Searched, Option<Jumps>) {
+        const MOST_ROUNDS: usize = 3;
+        let of_bead = !problem.base.free_start && !self.free_gain && floor.source.is_known();
+        let mut searched = self.under_noise(problem.clone(), floor, effort, &mut *progress);
+        let mut jumps = None;
+        for _ in 0..if of_bead { MOST_ROUNDS } else { 0 } {
+            let ctx = self.context(&searched.problem, 0);
+            let more = Jumps::find(&ctx, &searched.found.fit);
+            if more.count() == 0 {
+                break;
+            }
+            let all = more.and(jumps.clone().unwrap_or_default());
+            if !all.are_an_effect(&ctx, &searched.found.fit) {
+                break;
+            }
+            progress(&format!(
+                "the bead jumps in {} rows: once more without",
+                all.count()
+            ));
+            let open = problem
+                .clone()
+                .open_at(|record| all.rows_of(record).collect());
+            jumps = Some(all);
+            searched = self.under_noise(open, floor, effort, &mut *progress);
+        }
+        if let Some(jumps) = &mut jumps {
+            jumps.measure(&self.context(&searched.problem, 0), &searched.found.fit);
+        }
+        (searched, jumps)
     }
 
     /// Searches under the noise of the rig: a zero flow that moves, or, if that is more probable, one that stands still.

@@ -162,8 +162,8 @@ fn within(
         },
         work: (options.work * WORK) as u64,
     };
-    let Searched { mut found, problem } =
-        searching.under_noise(problem, &floor, effort, &mut *progress);
+    let (searched, jumps) = searching.beside_jumps(problem, &floor, effort, &mut *progress);
+    let Searched { mut found, problem } = searched;
     let ctx = searching.context(&problem, floor.rows);
     progress(&format!(
         "held-out check (the search took {:.2} of its work)",
@@ -192,6 +192,7 @@ fn within(
         model: given,
         records: &records,
         frames: &frames,
+        jumps: jumps.as_ref(),
         floor: &floor,
         threads: options.threads,
         unlike: unlike.as_deref(),

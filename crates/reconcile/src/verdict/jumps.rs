@@ -1,0 +1,183 @@
+//! Jumps of the bead or the table: steps of the position in single rows, which nothing announces.
+//!
+//! They are looked for in what a set leaves. A bad fix is another matter: it is off in one row, and the next is where it was. What a
+//! wrong equation leaves in single rows is where the command moves the bead, and a jump is anywhere.
+
+use crate::dot::dot;
+use crate::fit::context::{Context, Fit};
+use crate::problem::Prepared;
+use crate::thresholds::THRESHOLDS;
+
+/// Standard deviations of one chance in a thousand, both ways.
+const ONE_IN_A_THOUSAND: f64 = 3.29;
+
+/// A step in one row, or in two if it came during an exposure.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Jump {
+    pub record: usize,
+    pub row: usize,
+    pub um: f64,
+}
+
+/// A record in which jumps were looked for.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Searched {
+    pub name: String,
+    pub rows: usize,
+}
+
+/// The jumps of all records.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Jumps {
+    pub records: Vec<Searched>,
+    all: Vec<Jump>,
+    /// Their gain in twice the log-likelihood.
+    pub gain: f64,
+}
+
+impl Jumps {
+    /// The jumps in what a fit leaves.
+    pub(crate) fn find(ctx: &Context<'_>, fit: &Fit) -> Self {
+        let mut found = Self::default();
+        let records = &ctx.problem.records;
+        for (record, (r, e)) in records.iter().zip(&fit.innovations).enumerate() {
+            found.records.push(Searched {
+                name: r.name.clone(),
+                rows: r.u.len(),
+            });
+            found.find_in(record, r, e.clone());
+        }
+        found
+    }
+
+    /// Takes off one after another, the largest first.
+    fn find_in(&mut self, record: usize, r: &Prepared, mut e: Vec<f64>) {
+        let first = self.all.len();
+        let mut seen = vec![false; e.len()];
+        loop {
+            let open = e.iter().enumerate().filter(|(k, _)| !seen[*k]);
+            let Some((row, size)) = open.max_by(|a, b| a.1.abs().total_cmp(&b.1.abs())) else {
+                return;
+            };
+            if size.abs() < THRESHOLDS.jump_sd {
+                break;
+            }
+            seen[row] = true;
+            let of = |from: usize, until: usize| -> Vec<f64> {
+                let raw = |k: usize| f64::from(u8::from((from..until).contains(&k)));
+                r.whitened(&(0..e.len()).map(raw).collect::<Vec<f64>>())
+            };
+            // An exposure during which it came shows a part of it.
+            let [step, edge] = [of(row, e.len()), of(row, row + 1)];
+            let gain = gain_of(&step, &e);
+            if gain < THRESHOLDS.jump_sd.powi(2).max(gain_of(&edge, &e)) {
+                continue;
+            }
+            let [um, part_um] = fitted([&step, &edge], &e);
+            for (e, (step, edge)) in e.iter_mut().zip(step.iter().zip(&edge)) {
+                *e -= um * step + part_um * edge;
+            }
+            self.gain += gain;
+            let of_this = self.all[first..].iter_mut();
+            match of_this.into_iter().find(|j| j.row.abs_diff(row) <= 1) {
+                Some(same) => same.um += um,
+                None => self.all.push(Jump { record, row, um }),
+            }
+        }
+    }
+
+    /// Measures their sizes in what a fit leaves whose position is open there: from what the rows before predict to the row behind.
+    pub(crate) fn measure(&mut self, ctx: &Context<'_>, fit: &Fit) {
+        let (residual, _) = ctx.residual(fit);
+        for (record, (r, left)) in ctx.problem.records.iter().zip(&residual).enumerate() {
+            let expected = r.whitener.ahead(left);
+            for jump in self.all.iter_mut().filter(|j| j.record == record) {
+                let behind = (jump.row + 1..left.len()).find(|k| r.present[*k]);
+                if let Some(behind) = behind {
+                    jump.um = left[behind] - expected[jump.row];
+                }
+            }
+        }
+    }
+
+    /// The same with those that were found before.
+    pub(crate) fn and(mut self, before: Self) -> Self {
+        self.gain += before.gain;
+        self.all.extend(before.all);
+        self
+    }
+
+    pub(crate) fn count(&self) -> usize {
+        self.all.len()
+    }
+
+    /// The rows of a record at which the position is anywhere: an exposure may have seen a part of a jump.
+    pub(crate) fn rows_of(&self, record: usize) -> impl Iterator<Item = usize> {
+        let here = self.all.iter().filter(move |j| j.record == record);
+        here.flat_map(|j| [j.row, j.row + 1])
+    }
+
+    /// Root of the mean square of their sizes \[um\].
+    pub(crate) fn rms_um(&self) -> f64 {
+        let squares = self.all.iter().map(|j| j.um * j.um);
+        (squares.sum::<f64>() / self.count().max(1) as f64).sqrt()
+    }
+
+    /// Half the width of its 95 % interval, by the scatter of the sizes \[um\].
+    pub(crate) fn rms_error_um(&self) -> f64 {
+        let (rms, n) = (self.rms_um(), self.count().max(2) as f64);
+        let off = self.all.iter().map(|j| (j.um * j.um - rms * rms).powi(2));
+        1.96 * (off.sum::<f64>() / (n * (n - 1.0))).sqrt() / (2.0 * rms.max(f64::MIN_POSITIVE))
+    }
+
+    /// The largest of at least one.
+    pub(crate) fn largest(&self) -> Jump {
+        let larger = |a: &&Jump, b: &&Jump| a.um.abs().total_cmp(&b.um.abs());
+        *self.all.iter().max_by(larger).expect("a jump")
+    }
+
+    /// Whether they are an effect: as many as a fault of the camera has, few of all rows, and no likelier while the bead is driven.
+    pub(crate) fn are_an_effect(&self, ctx: &Context<'_>, fit: &Fit) -> bool {
+        let rows: usize = self.records.iter().map(|r| r.rows).sum();
+        (THRESHOLDS.faults_least..rows / 100).contains(&self.count())
+            && self.driven_sd(ctx, fit).abs() < ONE_IN_A_THOUSAND
+    }
+
+    /// Mean rank of their rows among all by the speed of the bead that the commands make, in standard deviations from chance (Wilcoxon).
+    fn driven_sd(&self, ctx: &Context<'_>, fit: &Fit) -> f64 {
+        let simulated = ctx.simulated(&fit.parts, fit.offset_um, &ctx.problem.all());
+        let speed = |y: &[f64], row: usize| (y[row] - y[row.saturating_sub(1)]).abs();
+        let rows = simulated
+            .iter()
+            .flat_map(|y| (1..y.len()).map(|k| speed(y, k)));
+        let mut speeds: Vec<f64> = rows.collect();
+        speeds.sort_by(f64::total_cmp);
+        let all = speeds.len().max(1) as f64;
+        let rank = |jump: &Jump| {
+            let own = speed(&simulated[jump.record], jump.row);
+            let below = speeds.partition_point(|v| *v < own);
+            let up_to = speeds.partition_point(|v| *v <= own);
+            0.5 * (below + up_to) as f64 / all
+        };
+        let n = self.count() as f64;
+        let mean = self.all.iter().map(rank).sum::<f64>() / n;
+        (mean - 0.5) * (12.0 * n).sqrt()
+    }
+}
+
+/// What a column explains of innovations, in twice the log-likelihood.
+fn gain_of(column: &[f64], e: &[f64]) -> f64 {
+    dot(column, e).powi(2) / dot(column, column).max(f64::MIN_POSITIVE)
+}
+
+/// Sizes of two columns fitted to innovations.
+fn fitted([a, b]: [&[f64]; 2], e: &[f64]) -> [f64; 2] {
+    let (aa, ab, bb) = (dot(a, a), dot(a, b), dot(b, b));
+    let (ae, be) = (dot(a, e), dot(b, e));
+    let det = aa * bb - ab * ab;
+    if det > 1e-12 * aa * bb {
+        [(bb * ae - ab * be) / det, (aa * be - ab * ae) / det]
+    } else {
+        [ae / aa.max(f64::MIN_POSITIVE), 0.0]
+    }
+}
