@@ -349,12 +349,7 @@ impl Localiser {
         {
             fix.verdict = FixQuality::NoSignal;
         }
-        let variance = self.pixel_variance(fix.background) * widening;
-        let (at, radius_px) = ((fix.x_px, fix.y_px), self.template.radius_px());
-        if fix.verdict == FixQuality::Good
-            && self.comb.is_still()
-            && left.has_rival(&self.crop, at, radius_px, self.sign, variance)
-        {
+        if fix.verdict == FixQuality::Good && self.has_rival(&fix, &left, widening) {
             fix.verdict = FixQuality::BadFit;
         }
         if let Some(pass) = found.filter(|_| fix.verdict == FixQuality::Good) {
