@@ -3,6 +3,7 @@
 
 use crate::beyond::{Asked, middle};
 use crate::crop::{Crop, LANES, Row, STRIDE};
+use crate::fibre;
 use crate::fit::Image;
 use crate::offsets::Lines;
 use crate::streak::Comb;
@@ -13,9 +14,9 @@ use wide::f32x4;
 /// times its correlation with the place, which is 0.27 in the narrowest default window: by less than one standard deviation.
 const LEAST_SLOPE: f64 = 2.5;
 const LEAST_SIZE: f64 = 3.0;
-/// Share of a bead's contrast squared that a stretch along a direction adds if it is no bead. A Gaussian has 0.1 of it where one of its axes
-/// is 1.9 times the other; one that moves by its diameter while the shutter is open has 0.04.
-const LEAST_STRETCH: f64 = 0.1;
+/// Chi-square of a contrast from which the score of a stretch shows any fibre. The score of a fibre twice as long as the bead and 1.3 times
+/// as wide has 0.03 of that chi-square: it is 5.5 standard deviations. Noise takes one of 700 below [`LEAST_SLOPE`].
+const SHOWS_A_STRETCH: f64 = 1000.0;
 /// Light of a bead's core, over its contrast.
 const CORE: f32 = 0.3;
 
@@ -26,8 +27,9 @@ pub(crate) struct Left {
     pub strongest: f32,
     /// Score tests, in standard deviations of noise of variance 1 grey^2: slope along the row, along the column, size.
     scores: [f64; 3],
-    /// Square of the score of a stretch along any direction, and of the bead's contrast: chi-square of noise of variance 1 grey^2.
-    stretch: f64,
+    /// Scores of a stretch along the row and along the diagonal, and square of that of the bead's contrast, as a chi-square of noise of
+    /// variance 1 grey^2.
+    stretch: [f64; 2],
     contrast: f64,
     /// Contrast of the bead's brightest pixel, grey levels.
     brightest: f64,
@@ -38,11 +40,29 @@ pub(crate) struct Left {
 }
 
 impl Left {
-    /// Whether something else explains as much as a bead, where noise has a variance: one bright pixel, or a fibre or an edge, which
-    /// is about twice as long one way as the other.
-    pub(crate) fn has_rival(&self, variance: f64) -> bool {
-        let long = LEAST_SLOPE * LEAST_SLOPE * variance + LEAST_STRETCH * self.contrast;
-        self.stretch > long || self.brightest.powi(2) > self.contrast
+    /// Whether a bright pixel, a fibre or an edge explains more than the bead does, for noise of a variance. A fibre or an edge is about
+    /// twice as long one way as the other.
+    pub(crate) fn has_rival(
+        &self,
+        crop: &Crop,
+        at: (f64, f64),
+        radius_px: f64,
+        sign: f64,
+        variance: f64,
+    ) -> bool {
+        if self.brightest.powi(2) > self.contrast {
+            return true;
+        }
+        let [along, diagonal] = self.stretch.map(|score| sign * score);
+        let stretch = along * along + diagonal * diagonal;
+        if stretch < LEAST_SLOPE * LEAST_SLOPE * variance
+            && self.contrast > SHOWS_A_STRETCH * variance
+        {
+            return false;
+        }
+        // The scores are proportional to the cosine and the sine of twice the fibre's angle.
+        let (sin, cos) = (0.5 * diagonal.atan2(along)).sin_cos();
+        fibre::explains(crop, at, radius_px, (cos, sin), sign) > self.contrast
     }
 
     /// What the window asks for besides place, contrast and level, where noise of a variance is all that is left.
@@ -281,11 +301,11 @@ impl Moments {
         self.weighted += row.weighted;
     }
 
-    /// Square of the score of a stretch along row and column, and of one along the diagonals.
-    fn stretch(&self) -> f64 {
+    /// Scores of a stretch along the row and across the column, and of one along the diagonals.
+    fn stretch(&self) -> [f64; 2] {
         let t = |lanes: f32x4| f64::from(lanes.reduce_add());
-        let score = |sum: f32x4, own: f32x4| t(sum).powi(2) / t(own).max(1e-12);
-        score(self.pr, self.pp) + score(self.qr, self.qq)
+        let score = |sum: f32x4, own: f32x4| t(sum) / t(own).max(1e-12).sqrt();
+        [score(self.pr, self.pp), score(self.qr, self.qq)]
     }
 
     fn sums(&self) -> Sums {

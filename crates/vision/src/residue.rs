@@ -31,10 +31,11 @@ const SAME_RADII: f64 = 2.0;
 /// Beads remembered when nobody says how many there are: the followed one and its neighbours.
 const FEW_BEADS: usize = 12;
 
-/// Degrees of freedom of a window's few patches: they tell a variance to half of it.
-const PATCHES_FREEDOM: f64 = 8.0;
-/// Least widening: of a window without noise.
-const LEAST_WIDENING: f64 = 1e-3;
+/// Least degrees of freedom for which [`Scales`] holds.
+const LEAST_FREEDOM: f64 = 2.0;
+/// Least widening: the noise of the pixels gives at least this variance of the place. A window without noise, as a codec makes it, has
+/// a smaller one. Its logarithm would outweigh those of many other windows.
+const LEAST_WIDENING: f64 = 1.0;
 
 /// One vector a patch: what its pixels add to the score of the position, relative to the bead's contrast.
 type Scores = [[f32; 2]; MAX_PATCHES];
@@ -46,6 +47,8 @@ struct Look {
     y_px: f64,
     used: u64,
     fixes: u32,
+    /// Number of the frame of the last fix.
+    frame: u64,
     /// Half the window that the scores are from: of another one they are not comparable.
     half: usize,
     mean: Scores,
@@ -58,6 +61,7 @@ impl Look {
         y_px: f64::NAN,
         used: 0,
         fixes: 0,
+        frame: 0,
         half: 0,
         mean: [[0.0; 2]; MAX_PATCHES],
     };
@@ -68,6 +72,8 @@ impl Look {
 pub(crate) struct Residues {
     looks: Vec<Look>,
     fixes: u64,
+    /// Frames begun so far.
+    frames: u64,
     /// What first and later fixes of all beads were widened by.
     pooled: [Scales; 2],
     /// Room for what the template leaves of a window, and its mean at whole distances from the bead, px.
@@ -80,10 +86,16 @@ impl Residues {
         Residues {
             looks: vec![Look::NONE; FEW_BEADS],
             fixes: 0,
+            frames: 1,
             pooled: [Scales::default(); 2],
             left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
             rings: Box::new([0.0; RINGS]),
         }
+    }
+
+    /// Begins another frame.
+    pub(crate) fn begin_frame(&mut self) {
+        self.frames += 1;
     }
 
     /// Makes room for the looks of so many beads.
@@ -105,32 +117,36 @@ impl Residues {
         variance: f64,
     ) -> Option<f64> {
         let half = crop.width.max(crop.height) / 2;
-        let (scores, inverse) = self.scores(crop, template, comb, at, (amplitude, background))?;
+        let (scores, inverse, freedom) =
+            self.scores(crop, template, comb, at, (amplitude, background))?;
         let common = in_common(crop, self.left.as_slice());
         let relative = variance / (amplitude * amplitude);
         let reach_px = SAME_RADII * template.radius_px();
         let k = self.look(at, reach_px, half);
         let look = &mut self.looks[k];
-        let known = f64::from(look.fixes);
+        // A window that is fitted again must not be compared with itself.
+        let again = look.frame == self.frames;
         // The mean so far has an error of its own: of n fixes 1/n of their variance.
+        let known = f64::from(look.fixes);
         let forgetting = (1.0 / (known + 1.0)).max(LOOK_FORGETTING);
-        let own = if look.fixes == 0 {
-            1.0
-        } else {
-            1.0 + forgetting
-        };
+        let is_new = look.fixes == 0 || again;
+        let own = if is_new { 1.0 } else { 1.0 + forgetting };
+        let mean = if is_new { &Look::NONE.mean } else { &look.mean };
         let kept = INTERPOLATED + (1.0 - INTERPOLATED) * common;
-        let now = widening_of(&scores, &look.mean, inverse, relative * own * kept)?;
-        let pool = &mut self.pooled[usize::from(look.fixes > 0)];
-        for (mean, score) in look.mean.iter_mut().zip(&scores) {
-            for (m, s) in mean.iter_mut().zip(score) {
-                *m += forgetting as f32 * (s - *m);
+        let now = widening_of(&scores, mean, inverse, relative * own * kept)?;
+        let pool = &mut self.pooled[usize::from(!is_new)];
+        if !again {
+            for (mean, score) in look.mean.iter_mut().zip(&scores) {
+                for (m, s) in mean.iter_mut().zip(score) {
+                    *m += forgetting as f32 * (s - *m);
+                }
             }
+            look.fixes = look.fixes.saturating_add(1);
+            look.frame = self.frames;
         }
-        look.fixes = look.fixes.saturating_add(1);
         let now = now.max(LEAST_WIDENING);
-        pool.take_in(now, PATCHES_FREEDOM);
-        Some(pool.moderate(now, PATCHES_FREEDOM))
+        pool.take_in(now, freedom);
+        Some(pool.moderate(now, freedom))
     }
 
     /// The look of the bead at a place: the one of the nearest fix before, or a new one in place of that unused for longest.
@@ -249,7 +265,8 @@ impl Residues {
         (x, y)
     }
 
-    /// The patches' scores, and the inverse of the information about the position, both for a contrast of 1. A residual that
+    /// The patches' scores, and the inverse of the information about the position, both for a contrast of 1. The third value is the degrees
+    /// of freedom of the sum of the squared scores in even noise (Satterthwaite 1946). A residual that
     /// is the same all round, or on opposite sides of the centre, as a template of another focus or size leaves it, does
     /// not move the position and does not count.
     fn scores(
@@ -259,7 +276,7 @@ impl Residues {
         comb: &Comb,
         (x_px, y_px): (f64, f64),
         (amplitude, background): (f64, f64),
-    ) -> Option<(Scores, Matrix2<f64>)> {
+    ) -> Option<(Scores, Matrix2<f64>, f64)> {
         let (x, y) = self.fill_left(crop, template, comb, (x_px, y_px), (amplitude, background));
         let (left, amplitude) = (self.left.as_mut_slice(), amplitude as f32);
         let mut image = Image::new(crop.width.next_multiple_of(LANES).min(STRIDE));
@@ -296,16 +313,18 @@ impl Residues {
         let columns = (2 * half + 1).div_ceil(side);
         let mut patches = [[0.0; 2]; MAX_PATCHES];
         let mut information = Matrix2::zeros();
+        let mut own = [[0.0_f32; 3]; MAX_PATCHES];
         for n in 0..=2 * down {
             let dy = n as f32 - down as f32;
             image.draw_row(template, comb, across as f32, dy);
             for m in 0..=2 * across {
                 let dx = m as f32 - across as f32;
-                let (Some(gx), Some(gy), Some(patch)) = (
+                let k = (n + half - down) / side * columns + (m + half - across) / side;
+                let (Some(gx), Some(gy), Some(patch), Some(own)) = (
                     image.by_x.get(m),
                     image.by_y.get(m),
-                    patches
-                        .get_mut((n + half - down) / side * columns + (m + half - across) / side),
+                    patches.get_mut(k),
+                    own.get_mut(k),
                 ) else {
                     continue;
                 };
@@ -315,9 +334,20 @@ impl Residues {
                 let odd = 0.5 / amplitude * (at(x + dx, y + dy) - at(x - dx, y - dy));
                 patch[0] += odd * gx;
                 patch[1] += odd * gy;
+                own[0] += gx * gx;
+                own[1] += gy * gy;
+                own[2] += gx * gy;
             }
         }
-        Some((patches, information.try_inverse()?))
+        let (mut all, mut squares) = (0.0_f32, 0.0_f32);
+        for [xx, yy, xy] in &own {
+            all += xx + yy;
+            squares += xx * xx + yy * yy + 2.0 * xy * xy;
+        }
+        // Patches opposite each other have the same score.
+        let freedom = f64::from(0.5 * all * all / squares.max(f32::MIN_POSITIVE));
+        let freedom = freedom.max(LEAST_FREEDOM);
+        Some((patches, information.try_inverse()?, freedom))
     }
 }
 
@@ -396,5 +426,64 @@ fn take_off_radial_mean(
                 *v -= sums[k] + t * (sums[k + 1] - sums[k]);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::LocaliserConfig;
+    use crate::frame::{Frame, Pixels};
+    use crate::template::ProfileSpec;
+
+    const SIDE: usize = 21;
+    const AT: (f64, f64) = (10.0, 10.0);
+
+    /// The widening for a window of a bead of contrast 400 with noise, relative to pixels of variance 1.
+    fn widened(residues: &mut Residues, noise: f64, is_new: bool) -> f64 {
+        let spec = ProfileSpec::Gaussian { sigma_px: 1.5 };
+        let template = LocaliserConfig::new(spec).template().unwrap();
+        let mut grey = vec![1000.0_f32; SIDE * SIDE];
+        template.draw(&mut grey, SIDE, AT.0, AT.1, 400.0);
+        let mut state = 7 + residues.fixes * u64::from(is_new);
+        let mut uniform = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005) + 1_442_695_040_888_963_407;
+            (state >> 33) as f64 / (1_u64 << 31) as f64 - 0.5
+        };
+        let mut normal = || (0..12).map(|_| uniform()).sum::<f64>();
+        let pixels = grey
+            .iter()
+            .map(|v| (f64::from(*v) + noise * normal()).round() as u16);
+        let pixels: Vec<u16> = pixels.collect();
+        let (width, height, pixels) = (SIDE, SIDE, Pixels::Mono16(&pixels));
+        let frame = Frame {
+            width,
+            height,
+            pixels,
+        };
+        let mut crop = Crop::new();
+        assert!(crop.take(&frame, AT.0, AT.1, SIDE));
+        let parts = (400.0, 1000.0 - f64::from(crop.pedestal));
+        residues.frames += u64::from(is_new);
+        let found = residues.widening(&crop, &template, &Comb::STILL, AT, parts, 1.0);
+        found.unwrap()
+    }
+
+    #[test]
+    fn a_window_that_is_fitted_again_is_not_compared_with_itself() {
+        let mut residues = Residues::new();
+        let first = widened(&mut residues, 5.0, true);
+        let again = widened(&mut residues, 5.0, false);
+        assert!(first > 5.0 && again > 0.99 * first, "{first} {again}");
+    }
+
+    #[test]
+    fn windows_without_noise_hardly_change_what_others_are_widened_by() {
+        let mut residues = Residues::new();
+        (0..40).for_each(|_| _ = widened(&mut residues, 2.0, true));
+        let before = residues.pooled[1].common().unwrap();
+        (0..2).for_each(|_| _ = widened(&mut residues, 0.0, true));
+        let after = residues.pooled[1].common().unwrap();
+        assert!(after > 0.75 * before, "{before} {after}");
     }
 }

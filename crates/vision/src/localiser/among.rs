@@ -19,6 +19,7 @@ impl Localiser {
     /// Position of a bead at a place (px) where none was. Unless the narrow window shows one now, nothing else is tried:
     /// [`Localiser::locate`] tries up to four times.
     pub(crate) fn locate_where_none_was(&mut self, frame: &Frame, place_px: (f64, f64)) -> Fix {
+        self.residues.begin_frame();
         let view = View::of(frame);
         let side_px = self.narrow_px().min(self.config.window_px);
         let fix = self.attempt(&view, place_px, side_px);
@@ -36,6 +37,7 @@ impl Localiser {
         places: impl Iterator<Item = (f64, f64)> + Clone,
         fixes: &mut Vec<Fix>,
     ) {
+        self.residues.begin_frame();
         fixes.clear();
         let mut drafted = Vec::new();
         let radius_px = self.template.radius_px();

@@ -140,6 +140,13 @@ impl Localiser {
         }
     }
 
+    /// Whether something else explains more of the window than the bead of a fix, whose noise is widened.
+    pub(super) fn has_rival(&self, fix: &Fix, left: &Left, widening: f64) -> bool {
+        let variance = self.pixel_variance(fix.background) * widening;
+        let (at, radius_px) = ((fix.x_px, fix.y_px), self.template.radius_px());
+        self.comb.is_still() && left.has_rival(&self.crop, at, radius_px, self.sign, variance)
+    }
+
     /// Lets a bad fit pass whose residual is the same all round: a bead in another focus, or blurred. The template has to explain
     /// most of what the bead adds to the window.
     pub(super) fn pardon(&mut self, frame: &Frame, fix: &mut Fix) {

@@ -213,6 +213,7 @@ impl Localiser {
     /// A fix whose verdict is not [`FixQuality::Good`] carries what was found, for the record; it must not be used as a
     /// position.
     pub fn locate(&mut self, frame: &Frame, guess: Option<(f64, f64)>) -> Fix {
+        self.residues.begin_frame();
         let radius_px = self.template.radius_px();
         let start =
             guess.or_else(|| seed::strongest(frame, self.sign, radius_px, self.config.min_snr));
@@ -348,8 +349,7 @@ impl Localiser {
         {
             fix.verdict = FixQuality::NoSignal;
         }
-        let variance = self.pixel_variance(fix.background) * widening;
-        if fix.verdict == FixQuality::Good && self.comb.is_still() && left.has_rival(variance) {
+        if fix.verdict == FixQuality::Good && self.has_rival(&fix, &left, widening) {
             fix.verdict = FixQuality::BadFit;
         }
         if let Some(pass) = found.filter(|_| fix.verdict == FixQuality::Good) {

@@ -4,7 +4,7 @@ use crate::common::Random;
 use crate::learnt::{AMPLITUDE, BACKGROUND, Field, SIDE, bound, disc, gaussian, measured_in, ring};
 use cellpos_vision::suggest::suggest;
 use cellpos_vision::{
-    Detector, FixQuality, Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec,
+    Detector, Fix, FixQuality, Frame, Localiser, LocaliserConfig, Pixels, ProfileSpec,
 };
 
 /// Sets one pixel in a hundred, the same in every frame, to something between black and twice as bright as a bead.
@@ -144,4 +144,57 @@ fn frames_without_beads_have_none() {
         }
     }
     assert!(failed.is_empty(), "{failed:?}");
+}
+
+/// Good fixes within a few px of the places, in fields of faint objects.
+fn seen_at(places: &[(f64, f64)], pixels: &[u16]) -> usize {
+    let spec = ProfileSpec::Gaussian { sigma_px: 1.0 };
+    let mut localiser = Localiser::new(LocaliserConfig::new(spec)).unwrap();
+    let frame = Frame {
+        width: SIDE,
+        height: SIDE,
+        pixels: Pixels::Mono16(pixels),
+    };
+    let mut detector = Detector::thorough(&localiser, 1000);
+    let blobs = detector.detect(&frame).iter().map(|b| (b.x_px, b.y_px));
+    let mut fixes = Vec::new();
+    localiser.locate_all(&frame, blobs, &mut fixes);
+    fixes.retain(|fix| fix.verdict == FixQuality::Good);
+    let seen = |p: &&(f64, f64)| {
+        let near = |f: &Fix| f64::hypot(f.x_px - p.0, f.y_px - p.1) < 6.0;
+        fixes.iter().any(near)
+    };
+    places.iter().filter(seen).count()
+}
+
+#[test]
+fn faint_fibres_are_no_beads_and_faint_beads_are_no_fibres() {
+    // Fibres are 3.5 times as long as the beads and a little wider, and not as bright.
+    let (along_px, across_px, contrast) = (3.5, 1.3, 0.8 * AMPLITUDE);
+    let noise = AMPLITUDE / 5.0;
+    let (_, profile) = gaussian(1.0);
+    let mut random = Random(43);
+    let (mut objects, mut beads, mut fibres) = (0, 0, 0);
+    for _ in 0..10 {
+        let field = Field::new(profile.as_ref(), AMPLITUDE / noise, &mut random);
+        objects += field.places.len();
+        beads += seen_at(&field.places, &field.pixels);
+        let mut grey: Vec<f64> = (0..SIDE * SIDE)
+            .map(|_| BACKGROUND + noise * random.normal())
+            .collect();
+        for (x, y) in &field.places {
+            let (sin, cos) = (core::f64::consts::PI * random.uniform()).sin_cos();
+            for (k, grey) in grey.iter_mut().enumerate() {
+                let (dx, dy) = ((k % SIDE) as f64 - x, (k / SIDE) as f64 - y);
+                let u = (cos * dx + sin * dy) / along_px;
+                let v = (cos * dy - sin * dx) / across_px;
+                *grey += contrast * (-0.5 * (u * u + v * v)).exp();
+            }
+        }
+        let pixels: Vec<u16> = grey.iter().map(|v| v.round() as u16).collect();
+        fibres += seen_at(&field.places, &pixels);
+    }
+    println!("{beads} beads and {fibres} fibres are good, of {objects} each");
+    assert!(100 * beads >= 95 * objects, "{beads} of {objects} beads");
+    assert!(50 * fibres <= objects, "{fibres} of {objects} fibres");
 }

@@ -361,6 +361,12 @@ fn beads_of_a_few_pixels_are_found_in_pictures_of_a_codec() {
 }
 
 #[test]
+fn the_error_in_pictures_of_a_codec_is_stated() {
+    // The window of a bead has too few patches to state an error of its own: it takes the part of the others.
+    run(&[(1, 40.0, Settings::Pasted, Spoil::Jpeg)], 300.0);
+}
+
+#[test]
 fn a_profile_is_learnt_from_the_beads_that_it_fits() {
     // Two beads in one region are as wide as one with its ring, and as many. Discs out of focus come in parts.
     let rows = [
