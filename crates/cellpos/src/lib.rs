@@ -25,6 +25,7 @@ mod commands;
 mod kept;
 mod keyboard;
 mod keys;
+mod loop_args;
 mod notify;
 mod outcome;
 mod output;

@@ -14,12 +14,12 @@ use crate::core::Core;
 use crate::life::{Life, Request};
 pub use crate::operator::Operator;
 use crate::realtime::{self, Conditions};
-use crate::recorder::{self, Feed, Pulse, PulseWatch, RecorderReport};
+use crate::recorder::{self, Pulse, PulseWatch, RecorderReport};
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, Finished, RunError, RunSink, close_session};
 use crate::summary::{Statistics, Summary};
 use crate::threads::{Acting, ControlEnd, Controlling, Next, Seeing, Shared};
-use crate::ticker::{Ends, RingSizes, Ticker};
+use crate::ticker::{Ends, Feed, RingSizes, Ticker};
 use cellpos_rig::clock::monotonic_ns;
 use cellpos_rig::{Actuator, Clock, PositionSource};
 use std::sync::Arc;
@@ -94,15 +94,8 @@ pub fn run<R: ReferenceGenerator + Send, S: RunSink + 'static>(
         measurements,
         orders,
         heard,
-        records,
-        events,
-        learned,
+        feed,
     } = ends;
-    let feed = Feed {
-        records,
-        events,
-        learned,
-    };
     let shared = Shared::default();
     let shared = &shared;
     let start = |thread: &'static str| move |source| RunError::Thread { thread, source };

@@ -15,10 +15,8 @@ use crate::operator::Operator;
 pub use crate::recording::{RecorderFault, RecorderReport, Unconfirmed};
 use crate::run::RunSink;
 use crate::summary::Statistics;
-use crate::tick_record::TickRecord;
-use cellpos_control::LearnerState;
+use crate::ticker::Feed;
 use cellpos_rig::clock::monotonic_ns;
-use rtrb::Consumer;
 use std::mem::{Discriminant, discriminant};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -125,14 +123,6 @@ impl DiskWatch {
             }),
         }
     }
-}
-
-/// The recorder's ends of the rings.
-#[derive(Debug)]
-pub(crate) struct Feed {
-    pub(crate) records: Consumer<TickRecord>,
-    pub(crate) events: Consumer<Event>,
-    pub(crate) learned: Consumer<(u16, LearnerState)>,
 }
 
 /// How often a kind of event came in the second that began last.

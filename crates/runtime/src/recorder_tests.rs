@@ -1,6 +1,8 @@
 use super::*;
 use crate::life::Request;
+use crate::tick_record::TickRecord;
 use crate::ticker::RingSizes;
+use cellpos_control::LearnerState;
 use cellpos_vision::FixQuality;
 use rtrb::{Producer, RingBuffer};
 

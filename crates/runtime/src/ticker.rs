@@ -39,10 +39,17 @@ pub struct Ends {
     /// For the actuator thread.
     pub heard: Producer<Heard>,
     /// For the recorder thread.
+    pub feed: Feed,
+}
+
+/// The recorder thread's ends of the rings.
+#[derive(Debug)]
+pub struct Feed {
+    /// The ticks.
     pub records: Consumer<TickRecord>,
-    /// For the recorder thread.
+    /// The events.
     pub events: Consumer<Event>,
-    /// For the recorder thread: what is being learned, of which motion. Full: the next one says more anyway.
+    /// What is being learned, of which motion. Full: the next one says more anyway.
     pub learned: Consumer<(u16, LearnerState)>,
 }
 
@@ -174,9 +181,11 @@ impl<R: ReferenceGenerator> Ticker<R> {
             measurements: measurements_in,
             orders: orders_out,
             heard: heard_in,
-            records: records_out,
-            events: events_out,
-            learned: learned_out,
+            feed: Feed {
+                records: records_out,
+                events: events_out,
+                learned: learned_out,
+            },
         };
         (ticker, ends)
     }

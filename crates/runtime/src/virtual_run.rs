@@ -7,7 +7,7 @@ use crate::core::Core;
 use crate::life::Request;
 use crate::pacer::{Pace, Pacer};
 use crate::realtime::Conditions;
-use crate::recorder::{Feed, Pulse, Recorder};
+use crate::recorder::{Pulse, Recorder};
 use crate::reference::ReferenceGenerator;
 use crate::run::{EndRule, EndWatch, Finished, RunError, RunSink, close_session};
 use crate::summary::{Statistics, Summary};
@@ -45,15 +45,8 @@ pub fn run<R: ReferenceGenerator, S: RunSink>(
         mut measurements,
         orders,
         heard,
-        records,
-        events,
-        learned,
+        feed,
     } = ends;
-    let feed = Feed {
-        records,
-        events,
-        learned,
-    };
     let pulse = Pulse::default();
     let mut recorder = Recorder::new(feed, &mut sink, &mut statistics, &pulse);
     let mut watch = EndWatch::new(end);

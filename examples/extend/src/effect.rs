@@ -20,15 +20,13 @@ pub struct SoftCoupling;
 static SPEC: Spec = Spec {
     id: "soft-coupling",
     place: Place::Pzt,
-    shown_at: "",
     equation: "x = u - give min(u, 0)",
     signature: "even harmonics in proportion to the amplitude, at all frequencies, without a lag",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new("give", "1", 0.0, 1.0)])],
     confused_with: &["valve-asymmetry"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "the same sine about another working point: the knee stays where the coupling is at rest",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for SoftCoupling {
@@ -49,10 +47,6 @@ impl EffectKind for SoftCoupling {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         [0.02, 0.1, 0.4].into_iter().map(|c| vec![c]).collect()
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

@@ -17,20 +17,19 @@ use crate::arguments::run_name;
 use crate::checked;
 use crate::clips;
 use crate::keys;
+use crate::loop_args::LoopArgs;
 use crate::notify::NotifyArgs;
 use crate::outcome::{CommandResult, Failure, Outcome, print_text};
 use crate::view_args::ViewArgs;
 use cellpos_emulator::FaultKind;
-use cellpos_numeric::units::Micrometers;
 use cellpos_record::{InputFile, LineFile, RunWriter};
 use cellpos_runtime::EndRule;
 use cellpos_script::{AmplitudeWatch, CycleRow, CycleTable, Plan, Script};
-use cellpos_session::adapt::{self, Adapt};
 use cellpos_session::clips::Clipped;
 use cellpos_session::live_line::Typed;
-use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
+use cellpos_session::rig_file::{ClockKind, Frames};
 use cellpos_session::sessions::SessionConfig;
-use cellpos_session::setup::{self, Setup};
+use cellpos_session::setup::Setup;
 use cellpos_session::view::{Page, Viewed};
 use cellpos_session::{Options, Rig, connect};
 use learning::Keeper;
@@ -58,38 +57,14 @@ pub(crate) struct Args {
     #[arg(required_unless_present = "resume", conflicts_with = "resume")]
     script: Option<PathBuf>,
     /// Resume a run that was stopped or cut off.
-    #[arg(long, value_name = "RUN", value_parser = crate::arguments::run_folder())]
+    #[arg(long, value_name = "RUN", value_parser = crate::arguments::run_folder(), conflicts_with_all = ["adapt", "ideal"])]
     resume: Option<PathBuf>,
     /// Rehearse on the virtual clock, on an emulated rig like --model.
     #[arg(long)]
     dry: bool,
-    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds best; pi needs less of a model.
-    #[arg(long, default_value = setup::DEFAULT_LAW)]
-    controller: String,
-    /// Follow gain and delay of the plant; default: on for lqg and mpc, off for pi and lead, else as controller.toml says.
-    #[arg(long, value_enum, conflicts_with = "resume")]
-    adapt: Option<Adapt>,
-    /// Rig file; default: the emulated rig.
-    #[arg(long)]
-    rig: Option<PathBuf>,
-    /// Model that the controller is made for: a model.toml, or eq6.
-    #[arg(long, default_value = "eq6")]
-    model: String,
     /// Learn the feed-forward of periodic motions, like `learn = true` in the script.
     #[arg(long, conflicts_with = "resume")]
     learn: bool,
-    /// Follow the bead or cell nearest to this position; default: `near_um` of `--rig`, else the most prominent.
-    #[arg(long, allow_hyphen_values = true)]
-    near: Option<Micrometers>,
-    /// Run in spite of errors of the rig file.
-    #[arg(long)]
-    anyway: bool,
-    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
-    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true", conflicts_with = "resume")]
-    ideal: Option<bool>,
-    /// Seed of the emulated rig; default: that of rig.toml.
-    #[arg(long)]
-    seed: Option<u64>,
     /// Clock of the emulated rig; default: real, with --dry virtual.
     #[arg(long, value_enum)]
     clock: Option<ClockKind>,
@@ -99,15 +74,11 @@ pub(crate) struct Args {
     /// Amplitude error that gives an alarm, % of the commanded amplitude (mean of ten cycles).
     #[arg(long, default_value_t = 10.0)]
     alarm_percent: f64,
-    /// Run without real-time priority.
-    #[arg(long)]
-    best_effort: bool,
-    /// Folder of the runs.
-    #[arg(long, default_value = "runs")]
-    runs: PathBuf,
     /// Name of the run; default: that of the script.
     #[arg(long, value_parser = run_name)]
     name: Option<String>,
+    #[command(flatten)]
+    run: LoopArgs,
     #[command(flatten)]
     queue: queue::QueueArgs,
     #[command(flatten)]
@@ -125,7 +96,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         return queue::run(&args, cells);
     }
     let mut ready = match &args.resume {
-        Some(folder) => match resume::ready(folder, args.best_effort)? {
+        Some(folder) => match resume::ready(folder, args.run.best_effort)? {
             Next::Session(ready) => *ready,
             Next::Nothing(why) => {
                 print_text(&format!("{why}\n"))?;
@@ -134,9 +105,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         },
         None => fresh(&args)?,
     };
-    if let Some(near) = args.near {
-        ready.file.near_um = Some(near.value());
-    }
+    args.run.choose_near(&mut ready.file);
     let over = start(&args, ready, true)?;
     Ok(if over.whole {
         Outcome::Done
@@ -155,12 +124,11 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
     }
     let path = args.script.as_deref().unwrap_or(Path::new(""));
     let (reference, script, mut inputs) = load::script(path)?;
-    let mut file = RigFile::load(args.rig.as_deref())?;
-    file.emulate_as(args.seed, args.ideal)?;
+    let mut file = args.run.file()?;
     if args.dry {
-        possible::rehearse(&mut file, &args.model);
+        possible::rehearse(&mut file, &args.run.model);
     }
-    for path in connect::inputs(args.rig.as_deref(), &file, &args.model, &args.controller) {
+    for path in args.run.inputs(&file) {
         inputs.push(InputFile::of(path).map_err(Failure::input)?);
     }
     let (clock, frames) = if args.dry {
@@ -172,8 +140,7 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
         let dry = if args.dry { "-dry" } else { "" };
         format!("{}{dry}", script.name)
     });
-    let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
-    adapt::choose(args.adapt, &mut prepared.controller);
+    let prepared = args.run.prepare(&file)?;
     Ok(Ready {
         prepared,
         file,
@@ -184,14 +151,14 @@ fn fresh(args: &Args) -> Result<Ready, Failure> {
             number: 1,
             first_cycle: 0,
             frames: args.frames.unwrap_or(frames) == Frames::On,
-            best_effort: args.best_effort,
+            best_effort: args.run.best_effort,
             alarm_percent: args.alarm_percent,
             learn: args.learn || script.learn,
             gap_s: None,
             after: None,
         },
         inputs,
-        runs: args.runs.clone(),
+        runs: args.run.runs.clone(),
         home: None,
     })
 }
@@ -225,8 +192,8 @@ fn start(args: &Args, ready: Ready, tell: bool) -> Result<Over, Failure> {
         },
         best_effort: config.best_effort,
     };
-    let path = args.rig.as_deref().filter(|_| !args.dry);
-    let mut rig = checked::open(file, options, path, args.anyway)?;
+    let path = args.run.rig.as_deref().filter(|_| !args.dry);
+    let mut rig = checked::open(file, options, path, args.run.anyway)?;
     rig.fit(&mut prepared);
     possible::allowed(&script, &plan, &prepared, &rig)?;
     let mut warnings = match config.learn {

@@ -7,6 +7,7 @@ use crate::checked;
 use crate::clips;
 use crate::kept;
 use crate::keys::{self, Steering};
+use crate::loop_args::LoopArgs;
 use crate::notify::{NotifyArgs, What};
 use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::view_args::ViewArgs;
@@ -15,13 +16,13 @@ use cellpos_numeric::units::{Micrometers, Seconds};
 use cellpos_record::RunWriter;
 use cellpos_runtime::realtime::Conditions;
 use cellpos_runtime::{EndRule, Summary};
-use cellpos_session::adapt::{self, Adapt};
+use cellpos_session::adapt;
 use cellpos_session::clips::Clipped;
 use cellpos_session::cyclic::{self, LearnSpec, Sine};
 use cellpos_session::live_line::{LiveLine, Typed};
 use cellpos_session::recording::Recording;
 use cellpos_session::rig_file::{ClockKind, Frames, RigFile};
-use cellpos_session::setup::{self, Prepared, ReferenceSpec, Setup};
+use cellpos_session::setup::{Prepared, ReferenceSpec, Setup};
 use cellpos_session::view::{Page, View, Viewed};
 use cellpos_session::words::of_what_is_followed;
 use cellpos_session::{EndKind, Ended, Finished, Options, Rig, connect};
@@ -46,9 +47,6 @@ pub(crate) struct Args {
     /// Duration; default: until Ctrl-C.
     #[arg(long, value_parser = positive::<Seconds>)]
     duration: Option<Seconds>,
-    /// pi, lead, lqg, mpc, or the path of a controller.toml. lqg holds best; pi needs less of a model.
-    #[arg(long, default_value = setup::DEFAULT_LAW)]
-    controller: String,
     /// Follow a sine about the target: amplitude@frequency.
     #[arg(long, value_name = "5um@50Hz")]
     sine: Option<Sine>,
@@ -61,45 +59,20 @@ pub(crate) struct Args {
     /// Solver of mpc; default: that of controller.toml, else active-set.
     #[arg(long, value_enum)]
     solver: Option<Solver>,
-    /// Follow gain and delay of the plant; default: on for lqg and mpc, off for pi and lead, else as controller.toml says.
-    #[arg(long, value_enum)]
-    adapt: Option<Adapt>,
-    /// Rig file; default: the emulated rig.
-    #[arg(long)]
-    rig: Option<PathBuf>,
-    /// Model that the controller is made for: a model.toml, or eq6.
-    #[arg(long, default_value = "eq6")]
-    model: String,
-    /// Follow the bead or cell nearest to this position; default: `near_um` of `--rig`, else the most prominent.
-    #[arg(long, allow_hyphen_values = true)]
-    near: Option<Micrometers>,
-    /// Run in spite of errors of the rig file.
-    #[arg(long)]
-    anyway: bool,
-    /// false: the emulated rig has the imperfections of a real one [default: as rig.toml says].
-    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
-    ideal: Option<bool>,
-    /// Seed of the emulated rig; default: that of rig.toml.
-    #[arg(long)]
-    seed: Option<u64>,
     /// Clock of the emulated rig.
     #[arg(long, value_enum, default_value = "real")]
     clock: ClockKind,
     /// Render frames of the emulated rig.
     #[arg(long, value_enum, default_value = "on")]
     frames: Frames,
-    /// Run without real-time priority.
-    #[arg(long)]
-    best_effort: bool,
-    /// Folder of the runs.
-    #[arg(long, default_value = "runs")]
-    runs: PathBuf,
     /// Name of the run.
     #[arg(long, default_value = "track", value_parser = run_name)]
     name: String,
     /// Do not write a run folder.
     #[arg(long)]
     no_record: bool,
+    #[command(flatten)]
+    run: LoopArgs,
     #[command(flatten)]
     view: ViewArgs,
     #[command(flatten)]
@@ -135,21 +108,16 @@ struct Report<'a> {
 
 /// Holds the bead.
 pub(crate) fn run(args: Args) -> CommandResult {
-    let mut file = RigFile::load(args.rig.as_deref())?;
-    file.emulate_as(args.seed, args.ideal)?;
-    if let Some(near) = args.near {
-        file.near_um = Some(near.value());
-    }
+    let file = args.run.file()?;
     let ticks = ticks(args.duration, file.timing.period_us)?;
     let options = Options {
         clock: args.clock,
         frames: args.frames,
-        best_effort: args.best_effort,
+        best_effort: args.run.best_effort,
     };
-    let mut prepared = connect::prepare(&args.model, &args.controller, &file)?;
+    let mut prepared = args.run.prepare(&file)?;
     choose_solver(args.solver, &mut prepared.controller)?;
-    adapt::choose(args.adapt, &mut prepared.controller);
-    let mut rig = checked::open(file, options, args.rig.as_deref(), args.anyway)?;
+    let mut rig = checked::open(file, options, args.run.rig.as_deref(), args.run.anyway)?;
     rig.fit(&mut prepared);
     target::check(args.target, args.sine.map(|sine| sine.amplitude), &rig)?;
     let predicted = cyclic::predicted(args.sine, &prepared, rig.file())?;
@@ -223,13 +191,13 @@ fn page(args: &Args) -> Page {
         || "hold".to_string(),
         |sine| format!("sine of {} at {}", sine.amplitude, sine.frequency),
     );
-    let rig = args.rig.as_ref().map_or_else(
+    let rig = args.run.rig.as_ref().map_or_else(
         || "emulated rig".to_string(),
         |path| path.display().to_string(),
     );
     Page {
         name: args.name.clone(),
-        subtitle: format!("track: {motion}, {}, {rig}", args.controller),
+        subtitle: format!("track: {motion}, {}, {rig}", args.run.controller),
         steered: args.sine.is_none(),
         script: false,
         notes: !args.no_record,
@@ -269,12 +237,12 @@ fn writer(args: &Args, rig: &Rig, setup: &Setup) -> Result<Option<RunWriter>, Fa
         return Ok(None);
     }
     let file = rig.file();
-    let mut inputs = connect::inputs(args.rig.as_deref(), file, &args.model, &args.controller);
+    let mut inputs = args.run.inputs(file);
     inputs.extend(args.learned.as_deref());
     let meta = connect::meta(&args.name, args.clock, &inputs, setup, rig)?;
     let ticks = ticks(args.duration, file.timing.period_us)?;
-    connect::room(&args.runs, ticks, &meta)?;
-    let writer = RunWriter::create(&args.runs, meta).map_err(Failure::input)?;
+    connect::room(&args.run.runs, ticks, &meta)?;
+    let writer = RunWriter::create(&args.run.runs, meta).map_err(Failure::input)?;
     Ok(Some(writer))
 }
 
@@ -367,7 +335,7 @@ fn conclude(
         ended: &ended,
         summary: &summary,
         target_um: args.target.value(),
-        controller: &args.controller,
+        controller: &args.run.controller,
         bound_rms_nm,
         conditions: &conditions,
         warnings: &warnings,

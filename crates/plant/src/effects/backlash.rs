@@ -8,28 +8,24 @@ use super::{
 
 /// Play in the coupling to the syringe: `x = max(u - width/2, min(u + width/2, x))`.
 pub fn backlash(width_um: f64) -> Effect {
-    Effect::new(&KIND, 0, &[width_um], &[])
+    Effect::new(&Backlash, 0, &[width_um], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct Backlash;
 
-pub(super) static KIND: Backlash = Backlash;
-
 static SPEC: Spec = Spec {
     id: "backlash",
     place: Place::Pzt,
-    shown_at: "",
     equation: "x = max(u - width/2, min(u + width/2, x))",
     signature: "a lag that shrinks as the amplitude grows; flat after every reversal",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "width_um", "um", 0.0, 100.0,
     )])],
     confused_with: &["pzt-hysteresis", "wall-adhesion"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "an amplitude sweep: the lag of backlash shrinks to nothing, hysteresis grows, adhesion stops the bead at small amplitude",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for Backlash {
@@ -52,10 +48,6 @@ impl EffectKind for Backlash {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([0.01, 0.03, 0.1, 0.25, 0.5, 1.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

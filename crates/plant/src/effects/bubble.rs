@@ -12,21 +12,17 @@ use crate::phi::phi_real;
 ///
 /// It dissolves: `lag(t) = lag exp(-dissolution t)`; zero for a lasting bubble.
 pub fn bubble(lag_s: f64, dissolution_per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[lag_s, dissolution_per_s], &[])
+    Effect::new(&Bubble, 0, &[lag_s, dissolution_per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct Bubble;
 
-pub(super) static KIND: Bubble = Bubble;
-
 static SPEC: Spec = Spec {
     id: "bubble",
     place: Place::Chip,
-    shown_at: "",
     equation: "1/(1 + lag s), lag(t) = lag exp(-dissolution t)",
     signature: "an extra pole that drifts as the bubble dissolves",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("lag_s", "s", 1e-6, 100.0),
         ParameterSpec::new("dissolution_per_s", "1/s", -10.0, 10.0).or(0.0),
@@ -35,6 +31,7 @@ static SPEC: Spec = Spec {
     inseparable_from: &["driver-lag"],
     experiment: Experiment::Band,
     separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
+    ..Spec::PLAIN
 };
 
 /// The experiment that distinguishes a bubble from a lag of the driver.
@@ -84,10 +81,6 @@ impl EffectKind for Bubble {
         } else {
             grid(&[1e-3, 8e-3, 0.05], &[0.03])
         }
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

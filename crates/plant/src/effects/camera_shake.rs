@@ -9,30 +9,26 @@ use nalgebra::Complex;
 
 /// The PZT's motion through a second-order high-pass, added to the record: `share s^2/(s^2 + 2 zeta w s + w^2)`.
 pub fn camera_shake(frequency_hz: f64, damping: f64, share: f64) -> Effect {
-    Effect::new(&KIND, 0, &[frequency_hz, damping, share], &[])
+    Effect::new(&CameraShake, 0, &[frequency_hz, damping, share], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct CameraShake;
 
-pub(super) static KIND: CameraShake = CameraShake;
-
 static SPEC: Spec = Spec {
     id: "camera-shake",
     place: Place::Camera,
-    shown_at: "",
     equation: "y + share s^2/(s^2 + 2 zeta w s + w^2) x",
     signature: "a resonance on the measured side only, its phase +180 deg below it",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("frequency_hz", "Hz", 1.0, 1e5),
         ParameterSpec::new("damping", "", 1e-4, 5.0),
         ParameterSpec::new("share", "", -10.0, 10.0),
     ])],
     confused_with: &["pzt-resonance"],
-    inseparable_from: &[],
     experiment: Experiment::Band,
     separate_by: "the camera on another table: a resonance of the piezo stays, one of the stand does not",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for CameraShake {
@@ -66,9 +62,5 @@ impl EffectKind for CameraShake {
             .iter()
             .flat_map(|hz| [0.03, 0.2].map(|z| vec![*hz, z, 0.02]))
             .collect()
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }

@@ -7,26 +7,22 @@ use super::{
 
 /// Frame k is taken at `t_k (1 + 1e-6 ppm)` of the drive's clock.
 pub fn clock_skew(ppm: f64) -> Effect {
-    Effect::new(&KIND, 0, &[ppm], &[])
+    Effect::new(&ClockSkew, 0, &[ppm], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct ClockSkew;
 
-pub(super) static KIND: ClockSkew = ClockSkew;
-
 static SPEC: Spec = Spec {
     id: "clock-skew",
     place: Place::Camera,
-    shown_at: "",
     equation: "t' = (1 + e) t",
     signature: "a phase error that grows through the record in proportion to frequency",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new("ppm", "ppm", -1e5, 1e5)])],
     confused_with: &["time-delay"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "one long record: compare its first and its last third at a low and at a high frequency",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for ClockSkew {
@@ -46,9 +42,5 @@ impl EffectKind for ClockSkew {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([-400.0, -100.0, -20.0, 20.0, 100.0, 400.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }

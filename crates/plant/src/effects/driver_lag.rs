@@ -9,21 +9,17 @@ use std::f64::consts::TAU;
 
 /// First-order low-pass of the amplifier, `x' = w (u - x)`, `w = 2 pi bandwidth`; -3 dB at `bandwidth_hz`.
 pub fn driver_lag(bandwidth_hz: f64) -> Effect {
-    Effect::new(&KIND, 0, &[bandwidth_hz], &[])
+    Effect::new(&DriverLag, 0, &[bandwidth_hz], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct DriverLag;
 
-pub(super) static KIND: DriverLag = DriverLag;
-
 static SPEC: Spec = Spec {
     id: "driver-lag",
     place: Place::Driver,
-    shown_at: "",
     equation: "x' = 2 pi bandwidth (u - x)",
     signature: "gain rolls off and the phase goes to -90 deg, the same at all amplitudes",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "bandwidth_hz",
         "Hz",
@@ -39,6 +35,7 @@ static SPEC: Spec = Spec {
     inseparable_from: &["bubble"],
     experiment: Experiment::Band,
     separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for DriverLag {
@@ -66,10 +63,6 @@ impl EffectKind for DriverLag {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([15.0, 50.0, 120.0, 300.0, 800.0, 2000.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

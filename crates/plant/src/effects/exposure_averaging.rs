@@ -7,21 +7,17 @@ use super::{
 
 /// The mean over the exposure that ends with the frame: gain `sinc(f Te)`, phase `-180 f Te` deg.
 pub fn exposure_averaging(exposure_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[exposure_s], &[])
+    Effect::new(&ExposureAveraging, 0, &[exposure_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct ExposureAveraging;
 
-pub(super) static KIND: ExposureAveraging = ExposureAveraging;
-
 static SPEC: Spec = Spec {
     id: "exposure-averaging",
     place: Place::Camera,
-    shown_at: "",
     equation: "mean of y over the exposure",
     signature: "gain sinc(f Te) and phase -180 f Te deg",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "exposure_s",
         "s",
@@ -29,9 +25,9 @@ static SPEC: Spec = Spec {
         1.0,
     )])],
     confused_with: &["time-delay", "driver-lag"],
-    inseparable_from: &[],
     experiment: Experiment::Band,
     separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for ExposureAveraging {
@@ -60,10 +56,6 @@ impl EffectKind for ExposureAveraging {
 
     fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
         one([0.2, 0.5, 0.9].map(|k| k * scope.sample_s))
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

@@ -8,28 +8,24 @@ use super::{
 
 /// A constant flow added to the plant's.
 pub fn flow_drift(um_per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[um_per_s], &[])
+    Effect::new(&FlowDrift, 0, &[um_per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct FlowDrift;
 
-pub(super) static KIND: FlowDrift = FlowDrift;
-
 static SPEC: Spec = Spec {
     id: "flow-drift",
     place: Place::Bead,
-    shown_at: "",
     equation: "v = v0 + um_per_s",
     signature: "a ramp in every record, the input at rest included",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "um_per_s", "um/s", -1e4, 1e4,
     )])],
     confused_with: &["leak", "pzt-creep"],
-    inseparable_from: &[],
     experiment: Experiment::Slow,
     separate_by: "a rest of ten seconds: a drift goes on, creep and leak die out; reverse a step: those flip, a drift does not",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for FlowDrift {
@@ -53,10 +49,6 @@ impl EffectKind for FlowDrift {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([-5.0, 5.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

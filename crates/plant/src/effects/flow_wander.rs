@@ -1,35 +1,31 @@
 //! `flow-wander`: a flow that wanders.
 
 use super::{
-    Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place, Scope, Spec,
+    Action, Block, Effect, EffectKind, Experiment, Form, ParameterSpec, Piece, Place, Spec,
 };
 use cellpos_numeric::Random;
 
 /// A flow that wanders: an Ornstein-Uhlenbeck process of `um_per_s` RMS and the correlation time `time_s`; nothing without a seed.
 pub fn flow_wander(um_per_s: f64, time_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[um_per_s, time_s], &[])
+    Effect::new(&FlowWander, 0, &[um_per_s, time_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct FlowWander;
 
-pub(super) static KIND: FlowWander = FlowWander;
-
 static SPEC: Spec = Spec {
     id: "flow-wander",
     place: Place::Bead,
-    shown_at: "",
     equation: "dv = -v dt/T + noise",
     signature: "slow motion without relation to the command, at rest too",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("um_per_s", "um/s", 0.0, 1e4),
         ParameterSpec::new("time_s", "s", 1e-3, 1e4),
     ])],
     confused_with: &["flow-drift"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "a rest of a minute: its increments are correlated over seconds",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for FlowWander {
@@ -45,10 +41,6 @@ impl EffectKind for FlowWander {
             way: 0.0,
             random: None,
         }))
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

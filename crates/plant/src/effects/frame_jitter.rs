@@ -1,32 +1,26 @@
 //! `frame-jitter`: each frame is late by a random time.
 
-use super::{
-    Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,
-};
+use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Shown, Spec};
 use cellpos_numeric::Random;
 
 /// Each frame is late by a time drawn evenly from 0 to `up_to_s`; nothing without a seed.
 pub fn frame_jitter(up_to_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[up_to_s], &[])
+    Effect::new(&FrameJitter, 0, &[up_to_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct FrameJitter;
 
-pub(super) static KIND: FrameJitter = FrameJitter;
-
 static SPEC: Spec = Spec {
     id: "frame-jitter",
     place: Place::Camera,
-    shown_at: "",
     equation: "y(t - d), d even in 0..up_to",
     signature: "noise in proportion to the speed",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new("up_to_s", "s", 0.0, 0.1)])],
     confused_with: &["time-delay"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "the time stamps of the frames",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for FrameJitter {
@@ -40,10 +34,6 @@ impl EffectKind for FrameJitter {
             last: None,
             random: None,
         }))
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

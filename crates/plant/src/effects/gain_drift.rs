@@ -8,26 +8,22 @@ use super::{
 
 /// The velocity gain drifts: `K(t) = K0 (1 + per_s t)`.
 pub fn gain_drift(per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[per_s], &[])
+    Effect::new(&GainDrift, 0, &[per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct GainDrift;
 
-pub(super) static KIND: GainDrift = GainDrift;
-
 static SPEC: Spec = Spec {
     id: "gain-drift",
     place: Place::Bead,
-    shown_at: "",
     equation: "K(t) = K0 (1 + rate t)",
     signature: "the gain of the first third of a record differs from that of the last",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new("per_s", "1/s", -1.0, 1.0)])],
     confused_with: &["gain-error"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "one long record: compare its first and its last third at a low and at a high frequency",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for GainDrift {
@@ -50,10 +46,6 @@ impl EffectKind for GainDrift {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([-0.01, -0.002, 0.002, 0.01])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

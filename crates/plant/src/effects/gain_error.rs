@@ -8,13 +8,11 @@ use crate::modal::Zpk;
 
 /// The bead's displacement is `factor` times the plant's (bead height in the slit, pixel scale, actuator gain).
 pub fn gain_error(factor: f64) -> Effect {
-    Effect::new(&KIND, 0, &[factor], &[])
+    Effect::new(&GainError, 0, &[factor], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct GainError;
-
-pub(super) static KIND: GainError = GainError;
 
 static SPEC: Spec = Spec {
     id: "gain-error",
@@ -22,14 +20,13 @@ static SPEC: Spec = Spec {
     shown_at: "bead/camera",
     equation: "x = factor x0",
     signature: "the same at all frequencies, amplitudes and times",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "factor", "", -100.0, 100.0,
     )])],
     confused_with: &["pdms-relaxation", "gain-drift"],
-    inseparable_from: &[],
     experiment: Experiment::Elsewhere,
     separate_by: "actuator gain, pixel scale and bead height give the same factor: image a stage micrometer for the pixel scale, measure the displacement of the piezo, and refocus on a bead at another height",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for GainError {
@@ -77,9 +74,5 @@ impl EffectKind for GainError {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([0.9, 1.1])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }

@@ -8,30 +8,26 @@ use std::f64::consts::TAU;
 
 /// The velocity gain swings: `K(t) = K0 (1 + depth sin(2 pi t / period + phase))`.
 pub fn gain_swing(depth: f64, period_s: f64, phase_deg: f64) -> Effect {
-    Effect::new(&KIND, 0, &[depth, period_s, phase_deg], &[])
+    Effect::new(&GainSwing, 0, &[depth, period_s, phase_deg], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct GainSwing;
 
-pub(super) static KIND: GainSwing = GainSwing;
-
 static SPEC: Spec = Spec {
     id: "gain-swing",
     place: Place::Bead,
-    shown_at: "",
     equation: "K(t) = K0 (1 + d sin(2 pi t/T + p))",
     signature: "the gain goes up and down through a record",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("depth", "", -1.0, 1.0),
         ParameterSpec::new("period_s", "s", 0.1, 1e4),
         ParameterSpec::new("phase_deg", "deg", -1e4, 1e4).or(0.0),
     ])],
     confused_with: &["gain-drift", "gain-error"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "one long record of the same sine: its amplitude goes up and down with the period",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for GainSwing {
@@ -67,10 +63,6 @@ impl EffectKind for GainSwing {
             .filter(|t| **t < 4.0 * scope.length_s)
             .flat_map(|t| [0.0, 90.0].map(|p| vec![0.1, *t, p]))
             .collect()
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

@@ -1,19 +1,15 @@
 //! `jumps`: the bead or the table jumps.
 
-use super::{
-    Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,
-};
+use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Shown, Spec};
 use cellpos_numeric::Random;
 
 /// Steps of `um` either way at random times, `per_s` a second; nothing without a seed.
 pub fn jumps(per_s: f64, um: f64) -> Effect {
-    Effect::new(&KIND, 0, &[per_s, um], &[])
+    Effect::new(&Jumps, 0, &[per_s, um], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct Jumps;
-
-pub(super) static KIND: Jumps = Jumps;
 
 static SPEC: Spec = Spec {
     id: "jumps",
@@ -21,15 +17,14 @@ static SPEC: Spec = Spec {
     shown_at: "bead/table",
     equation: "x + steps at random times",
     signature: "increments beyond the noise, nothing before or after",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("per_s", "1/s", 0.0, 1e3),
         ParameterSpec::new("um", "um", 0.0, 1e3),
     ])],
     confused_with: &["pixel-locking"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "a film of the bead at the moment of a jump",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for Jumps {
@@ -45,10 +40,6 @@ impl EffectKind for Jumps {
             last_s: 0.0,
             random: None,
         }))
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

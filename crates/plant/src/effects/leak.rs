@@ -8,21 +8,17 @@ use crate::modal::Zpk;
 
 /// Leak past the piston: `s / (s + corner)`.
 pub fn leak(corner_rad_per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[corner_rad_per_s], &[])
+    Effect::new(&Leak, 0, &[corner_rad_per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct Leak;
 
-pub(super) static KIND: Leak = Leak;
-
 static SPEC: Spec = Spec {
     id: "leak",
     place: Place::Chip,
-    shown_at: "",
     equation: "s/(s + corner)",
     signature: "a step sags exponentially to zero; phase lead at low frequencies",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "corner_rad_per_s",
         "rad/s",
@@ -30,9 +26,9 @@ static SPEC: Spec = Spec {
         1e4,
     )])],
     confused_with: &["pzt-creep", "pdms-relaxation", "flow-drift"],
-    inseparable_from: &[],
     experiment: Experiment::Slow,
     separate_by: "steps both ways with holds of a minute: log-time tail (creep), exponential (relaxation), sag to zero (leak)",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for Leak {
@@ -53,9 +49,5 @@ impl EffectKind for Leak {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([0.01, 0.05, 0.3, 1.0, 3.0, 10.0, 30.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }

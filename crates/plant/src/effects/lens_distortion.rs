@@ -1,34 +1,28 @@
 //! `lens-distortion`: the scale of the image changes across the field.
 
-use super::{
-    Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown, Spec,
-};
+use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Shown, Spec};
 
 /// `x + per_um2 (x - axis)^3` about the axis of the lens.
 pub fn lens_distortion(per_um2: f64, axis_um: f64) -> Effect {
-    Effect::new(&KIND, 0, &[per_um2, axis_um], &[])
+    Effect::new(&LensDistortion, 0, &[per_um2, axis_um], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct LensDistortion;
 
-pub(super) static KIND: LensDistortion = LensDistortion;
-
 static SPEC: Spec = Spec {
     id: "lens-distortion",
     place: Place::Camera,
-    shown_at: "",
     equation: "x + c (x - axis)^3",
     signature: "the gain differs by position, not by amplitude about one place",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("per_um2", "1/um^2", -1.0, 1.0),
         ParameterSpec::new("axis_um", "um", -1e4, 1e4).or(0.0),
     ])],
     confused_with: &["gain-error"],
-    inseparable_from: &[],
     experiment: Experiment::Elsewhere,
     separate_by: "a stage micrometer across the field",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for LensDistortion {
@@ -41,10 +35,6 @@ impl EffectKind for LensDistortion {
             per_um2: effect.scalar(0),
             axis_um: effect.scalar(1),
         }))
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

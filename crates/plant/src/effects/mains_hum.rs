@@ -3,35 +3,30 @@
 use super::pump_pulsation::Strokes;
 use super::{
     Action, Candidate, Effect, EffectKind, Experiment, FitParameter, Form, ParameterSpec, Place,
-    Role, Scope, Spec, lin,
+    Role, Spec, lin,
 };
 
 /// Camera, light or table. A line `um sin(2 pi hz t + phase)`, not tied to the input.
 pub fn mains_hum(hz: f64, um: f64, phase_deg: f64) -> Effect {
-    Effect::new(&KIND, 0, &[hz, um, phase_deg], &[])
+    Effect::new(&MainsHum, 0, &[hz, um, phase_deg], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct MainsHum;
 
-pub(super) static KIND: MainsHum = MainsHum;
-
 static SPEC: Spec = Spec {
     id: "mains-hum",
     place: Place::Camera,
-    shown_at: "",
     equation: "y + um sin(2 pi hz t + phase)",
     signature: "a line off the grid of the drive, its phase not tied to the input",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("hz", "Hz", 0.1, 1e4),
         ParameterSpec::new("um", "um", -100.0, 100.0),
         ParameterSpec::new("phase_deg", "deg", -360.0, 360.0).or(0.0),
     ])],
-    confused_with: &[],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "a rest with the light switched off and on, and one with the table damped",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for MainsHum {
@@ -58,9 +53,5 @@ impl EffectKind for MainsHum {
             line(&[lin("hz", 59.4, 60.6, 1e-3)]),
         ];
         ALL
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }

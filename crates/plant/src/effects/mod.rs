@@ -127,8 +127,20 @@ impl fmt::Display for Place {
     }
 }
 
+/// The kind of an effect as a trait object: every [`EffectKind`] has it.
+pub trait AsEffectKind {
+    /// The kind itself.
+    fn as_kind(&'static self) -> &'static dyn EffectKind;
+}
+
+impl<K: EffectKind> AsEffectKind for K {
+    fn as_kind(&'static self) -> &'static dyn EffectKind {
+        self
+    }
+}
+
 /// Everything that is known about one effect, apart from its numbers.
-pub trait EffectKind: fmt::Debug + Send + Sync {
+pub trait EffectKind: fmt::Debug + Send + Sync + AsEffectKind {
     /// Id, place, parameters, words.
     fn spec(&self) -> &'static Spec;
 
@@ -227,8 +239,17 @@ pub trait EffectKind: fmt::Debug + Send + Sync {
         Vec::new()
     }
 
-    /// The effect of candidate `index`, with these values of its parameters.
-    fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect;
+    /// The effect of candidate `index`, with these values of its parameters. By default they are the numbers of the form with that index,
+    /// or of the only form.
+    fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect {
+        let _ = scope;
+        let form = if index < self.spec().forms.len() {
+            index
+        } else {
+            0
+        };
+        Effect::new(self.as_kind(), form, values, &[])
+    }
 
     /// Delay that candidate `index` adds to a slow motion \[s\], if any.
     fn lag_s(&self, index: usize, values: &[f64]) -> Option<f64> {

@@ -30,6 +30,21 @@ pub struct Spec {
 }
 
 impl Spec {
+    /// An effect without peculiarities: the base of `..Spec::PLAIN`. Id, equation, signature, forms and `separate_by` are to be given.
+    pub const PLAIN: Self = Self {
+        id: "",
+        place: Place::Chip,
+        shown_at: "",
+        equation: "",
+        signature: "",
+        ahead_of_plant: false,
+        forms: &[],
+        confused_with: &[],
+        inseparable_from: &[],
+        experiment: Experiment::Long,
+        separate_by: "",
+    };
+
     /// The place as results print it.
     pub fn shown_place(&self) -> &'static str {
         if self.shown_at.is_empty() {

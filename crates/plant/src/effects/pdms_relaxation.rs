@@ -13,12 +13,12 @@ use crate::modal::Zpk;
 /// The gain far above the relaxation frequency is `1 + strength` times that below: the wall reduces slow motion. Its
 /// weight in the denominator of Eq. (A4), `alpha A2/A1`, is about 2e-8 and neglected.
 pub fn pdms_relaxation(time_s: f64, strength: f64) -> Effect {
-    Effect::new(&KIND, AT_REST, &[time_s, strength], &[])
+    Effect::new(&PdmsRelaxation, AT_REST, &[time_s, strength], &[])
 }
 
 /// The same wall for a model whose gain is that of fast motion: the factor of [`pdms_relaxation`] over `1 + strength`.
 pub fn pdms_relaxation_of_fast_gain(time_s: f64, strength: f64) -> Effect {
-    Effect::new(&KIND, AT_SPEED, &[time_s, strength], &[])
+    Effect::new(&PdmsRelaxation, AT_SPEED, &[time_s, strength], &[])
 }
 
 /// The model's gain is that of slow motion.
@@ -40,20 +40,16 @@ const FREE: Candidate =
 #[derive(Debug)]
 pub(super) struct PdmsRelaxation;
 
-pub(super) static KIND: PdmsRelaxation = PdmsRelaxation;
-
 static SPEC: Spec = Spec {
     id: "pdms-relaxation",
     place: Place::Chip,
-    shown_at: "",
     equation: "(1 + (1 + strength) time s)/(1 + time s), over 1 + strength where the model's gain is that of fast motion",
     signature: "a step in gain with a phase bump at 1/(2 pi time), in proportion to the amplitude",
-    ahead_of_plant: false,
     forms: &Form::anchored(NUMBERS),
     confused_with: &["pzt-creep", "leak", "gain-error"],
-    inseparable_from: &[],
     experiment: Experiment::Slow,
     separate_by: "steps both ways with holds of a minute: log-time tail (creep), exponential (relaxation), sag to zero (leak)",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for PdmsRelaxation {
@@ -81,10 +77,6 @@ impl EffectKind for PdmsRelaxation {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         grid(&[0.01, 0.03, 0.1, 0.3, 1.0, 3.0], &[0.1])
-    }
-
-    fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, form, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

@@ -8,30 +8,25 @@ use std::f64::consts::TAU;
 
 /// `x + amplitude pixel sin(2 pi x / pixel + phase)`: the bias of a centroid within a pixel; the amplitude in parts of a pixel.
 pub fn pixel_locking(pixel_um: f64, amplitude: f64, phase_deg: f64) -> Effect {
-    Effect::new(&KIND, 0, &[pixel_um, amplitude, phase_deg], &[])
+    Effect::new(&PixelLocking, 0, &[pixel_um, amplitude, phase_deg], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct PixelLocking;
 
-pub(super) static KIND: PixelLocking = PixelLocking;
-
 static SPEC: Spec = Spec {
     id: "pixel-locking",
     place: Place::Camera,
-    shown_at: "",
     equation: "x + amplitude pixel sin(2 pi x/pixel + phase)",
     signature: "an error periodic in position",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("pixel_um", "um", 1e-3, 100.0),
         ParameterSpec::new("amplitude", "px", -0.5, 0.5),
         ParameterSpec::new("phase_deg", "deg", -360.0, 360.0).or(0.0),
     ])],
-    confused_with: &[],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "a stage moved in steps of a tenth of a pixel",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for PixelLocking {
@@ -59,10 +54,6 @@ impl EffectKind for PixelLocking {
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         // Found by a scan over all pixel sizes at once.
         Vec::new()
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

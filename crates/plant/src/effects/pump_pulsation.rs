@@ -1,20 +1,18 @@
 //! `pump-pulsation`: the strokes of a pump.
 
 use super::{
-    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Role, Scope,
-    Shown, Spec, lin,
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Role, Shown,
+    Spec, lin,
 };
 use std::f64::consts::TAU;
 
 /// A line below 20 Hz with its second harmonic: `um (sin(w t + p) + second sin(2 (w t + p)))`.
 pub fn pump_pulsation(hz: f64, um: f64, second: f64, phase_deg: f64) -> Effect {
-    Effect::new(&KIND, 0, &[hz, um, second, phase_deg], &[])
+    Effect::new(&PumpPulsation, 0, &[hz, um, second, phase_deg], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct PumpPulsation;
-
-pub(super) static KIND: PumpPulsation = PumpPulsation;
 
 static SPEC: Spec = Spec {
     id: "pump-pulsation",
@@ -22,7 +20,6 @@ static SPEC: Spec = Spec {
     shown_at: "bead",
     equation: "y + um (sin(w t) + second sin(2 w t))",
     signature: "a line as of the mains, at the strokes of a pump",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("hz", "Hz", 1e-3, 1e3),
         ParameterSpec::new("um", "um", -1e3, 1e3),
@@ -30,9 +27,9 @@ static SPEC: Spec = Spec {
         ParameterSpec::new("phase_deg", "deg", -360.0, 360.0).or(0.0),
     ])],
     confused_with: &["mains-hum"],
-    inseparable_from: &[],
     experiment: Experiment::Long,
     separate_by: "the pump at another speed, and stopped",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for PumpPulsation {
@@ -53,10 +50,6 @@ impl EffectKind for PumpPulsation {
             ..Candidate::chain(&[lin("hz", 0.5, 20.0, 1e-4)])
         }];
         ALL
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

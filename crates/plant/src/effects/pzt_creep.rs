@@ -13,23 +13,23 @@ use nalgebra::Complex;
 /// The block is a bank of first-order lags, two per decade from 0.1 ms to 1000 s, each of weight g/2. It is linear, and differs
 /// from the logarithm by at most 0.1 % of g from 1 ms to 300 s (Kuhnen, Janocha 1998, linear creep operators).
 pub fn pzt_creep(per_decade: f64) -> Effect {
-    Effect::new(&KIND, AT_REST, &[per_decade], &[])
+    Effect::new(&PztCreep, AT_REST, &[per_decade], &[])
 }
 
 /// The same creep for a model with the gain of fast motion: `x = x0 (1 + g log10(t / 1 ms))`.
 pub fn pzt_creep_of_fast_gain(per_decade: f64) -> Effect {
-    Effect::new(&KIND, AT_SPEED, &[per_decade], &[])
+    Effect::new(&PztCreep, AT_SPEED, &[per_decade], &[])
 }
 
 /// Creep that begins some time after a step: `x = x0 (1 + g log10(1 + t/onset))`, for a model with the gain before that.
 pub fn pzt_creep_from(per_decade: f64, onset_s: f64) -> Effect {
-    Effect::new(&KIND, WITH_ONSET, &[per_decade, onset_s], &[])
+    Effect::new(&PztCreep, WITH_ONSET, &[per_decade, onset_s], &[])
 }
 
 /// Creep whose lags begin sharply at `onset_s`: the response has the factor `1 + g log10(1 + 1/(onset s))`, for a model with the gain
 /// before that.
 pub fn pzt_creep_of_lags_from(per_decade: f64, onset_s: f64) -> Effect {
-    Effect::new(&KIND, WITH_SHARP_ONSET, &[per_decade, onset_s], &[])
+    Effect::new(&PztCreep, WITH_SHARP_ONSET, &[per_decade, onset_s], &[])
 }
 
 /// The model's gain is that of a step after 0.1 s.
@@ -65,20 +65,16 @@ const FREE: Candidate = Candidate::chain(&[PER_DECADE_FREE])
 #[derive(Debug)]
 pub(super) struct PztCreep;
 
-pub(super) static KIND: PztCreep = PztCreep;
-
 static SPEC: Spec = Spec {
     id: "pzt-creep",
     place: Place::Pzt,
-    shown_at: "",
     equation: "x = x0 (1 + g log10(t/0.1 s)) after a step; t/1 ms where the model's gain is that of fast motion; 1 + t/onset where creep begins later; 1 + g log10(1 + 1/(onset s)) where it has no shorter lag",
     signature: "a tail in the logarithm of time that flips with the sign of the step; a constant phase of about -39 g deg",
-    ahead_of_plant: false,
     forms: &FORMS,
     confused_with: &["pdms-relaxation", "leak", "pzt-hysteresis"],
-    inseparable_from: &[],
     experiment: Experiment::Slow,
     separate_by: "steps both ways with holds of a minute: log-time tail (creep), exponential (relaxation), sag to zero (leak)",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for PztCreep {
@@ -131,10 +127,6 @@ impl EffectKind for PztCreep {
             WITH_ONSET | WITH_SHARP_ONSET => grid(&[0.03], &[0.01, 0.1]),
             _ => one([0.01, 0.05]),
         }
-    }
-
-    fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, form, values, &[])
     }
 }
 

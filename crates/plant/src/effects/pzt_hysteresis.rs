@@ -15,13 +15,23 @@ use super::{
 /// `1/(beta + gamma)` and the gain approaches 1. The equation is integrated in closed form along each straight change of u.
 /// `|gamma| <= beta` keeps the loop dissipative.
 pub fn bouc_wen(fraction: f64, beta_per_um: f64, gamma_per_um: f64) -> Effect {
-    Effect::new(&KIND, BOUC_WEN, &[fraction, beta_per_um, gamma_per_um], &[])
+    Effect::new(
+        &PztHysteresis,
+        BOUC_WEN,
+        &[fraction, beta_per_um, gamma_per_um],
+        &[],
+    )
 }
 
 /// The same equation as it is often programmed for sampled commands: one explicit step per change of the command, `h += du - beta |du| h
 /// - gamma du |h|`. It differs from [`bouc_wen`] if a single change `du` is not small against `1/(beta + gamma)`.
 pub fn bouc_wen_explicit(fraction: f64, beta_per_um: f64, gamma_per_um: f64) -> Effect {
-    Effect::new(&KIND, EXPLICIT, &[fraction, beta_per_um, gamma_per_um], &[])
+    Effect::new(
+        &PztHysteresis,
+        EXPLICIT,
+        &[fraction, beta_per_um, gamma_per_um],
+        &[],
+    )
 }
 
 /// Play operators (Prandtl-Ishlinskii): `x = v + quadratic_per_um v^2`, `v = sum w_i p_i`,
@@ -59,7 +69,7 @@ pub fn curved_play(thresholds_um: &[f64], weights: &[f64], curve: Curve) -> Effe
         curve.cubic_per_um2,
         curve.input_quadratic_per_um,
     ];
-    Effect::new(&KIND, PLAY, &scalars, &[thresholds_um, weights])
+    Effect::new(&PztHysteresis, PLAY, &scalars, &[thresholds_um, weights])
 }
 
 /// Play operators whose density falls off exponentially with the threshold, `fraction/width exp(-r/width)`, plus `1 - fraction`
@@ -78,8 +88,6 @@ pub fn exponential_play(fraction: f64, width_um: f64) -> Effect {
 #[derive(Debug)]
 pub(super) struct PztHysteresis;
 
-pub(super) static KIND: PztHysteresis = PztHysteresis;
-
 /// Indices of the forms.
 const BOUC_WEN: usize = 0;
 const EXPLICIT: usize = 1;
@@ -94,10 +102,8 @@ const NUMBERS: &[ParameterSpec] = &[
 static SPEC: Spec = Spec {
     id: "pzt-hysteresis",
     place: Place::Pzt,
-    shown_at: "",
     equation: "Bouc-Wen, or play operators sum w_i max(u - r_i, min(u + r_i, p_i))",
     signature: "a lag the same at all frequencies that grows with the amplitude; the gain rises with the amplitude; odd harmonics",
-    ahead_of_plant: false,
     forms: &[
         Form {
             name: "bouc-wen",
@@ -123,9 +129,9 @@ static SPEC: Spec = Spec {
         },
     ],
     confused_with: &["backlash", "wall-adhesion", "pzt-creep"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "the same sine at a second amplitude and a second frequency, and its third harmonic",
+    ..Spec::PLAIN
 };
 
 /// Thresholds of the freely weighted play operators, in parts of the stroke: even, closer together for small loops, and up to the full

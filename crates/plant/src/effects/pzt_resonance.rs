@@ -9,29 +9,25 @@ use std::f64::consts::TAU;
 
 /// Mechanical resonance: `w^2 / (s^2 + 2 zeta w s + w^2)`, undamped natural frequency and damping ratio.
 pub fn pzt_resonance(frequency_hz: f64, damping: f64) -> Effect {
-    Effect::new(&KIND, 0, &[frequency_hz, damping], &[])
+    Effect::new(&PztResonance, 0, &[frequency_hz, damping], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct PztResonance;
 
-pub(super) static KIND: PztResonance = PztResonance;
-
 static SPEC: Spec = Spec {
     id: "pzt-resonance",
     place: Place::Pzt,
-    shown_at: "",
     equation: "w^2/(s^2 + 2 zeta w s + w^2)",
     signature: "a peak, then -180 deg; the same at all amplitudes",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("frequency_hz", "Hz", 1.0, 1e6),
         ParameterSpec::new("damping", "", 1e-4, 5.0),
     ])],
     confused_with: &["driver-lag", "time-delay", "bubble"],
-    inseparable_from: &[],
     experiment: Experiment::Band,
     separate_by: "excite to 300 Hz and beyond: a pole rolls off, an exposure follows a sinc, a resonance peaks, a delay changes the phase only",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for PztResonance {
@@ -57,10 +53,6 @@ impl EffectKind for PztResonance {
             &[120.0, 200.0, 260.0, 330.0, 450.0, 700.0, 1200.0],
             &[0.03, 0.15, 0.6],
         )
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

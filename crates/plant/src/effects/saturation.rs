@@ -7,29 +7,25 @@ use super::{
 
 /// Clips the commanded displacement to `[low_um, high_um]`, absolute, not from the working point.
 pub fn saturation(low_um: f64, high_um: f64) -> Effect {
-    Effect::new(&KIND, 0, &[low_um, high_um], &[])
+    Effect::new(&Saturation, 0, &[low_um, high_um], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct Saturation;
 
-pub(super) static KIND: Saturation = Saturation;
-
 static SPEC: Spec = Spec {
     id: "saturation",
     place: Place::Driver,
-    shown_at: "",
     equation: "x = min(max(u, low), high)",
     signature: "flat tops at fixed levels; the gain falls above a knee",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("low_um", "um", -1e4, 1e4),
         ParameterSpec::new("high_um", "um", -1e4, 1e4),
     ])],
     confused_with: &["slew-limit"],
-    inseparable_from: &[],
     experiment: Experiment::Rates,
     separate_by: "the same amplitude at a tenth of the frequency: a slew limit vanishes, a clip stays",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for Saturation {

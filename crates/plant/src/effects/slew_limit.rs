@@ -7,21 +7,17 @@ use super::{
 
 /// Current limit of the amplifier into the piezo's capacity: `|dx/dt| <= rate`.
 pub fn slew_limit(rate_um_per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[rate_um_per_s], &[])
+    Effect::new(&SlewLimit, 0, &[rate_um_per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct SlewLimit;
 
-pub(super) static KIND: SlewLimit = SlewLimit;
-
 static SPEC: Spec = Spec {
     id: "slew-limit",
     place: Place::Driver,
-    shown_at: "",
     equation: "|dx/dt| <= rate",
     signature: "appears above a product of amplitude and frequency; triangles, odd harmonics",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "rate_um_per_s",
         "um/s",
@@ -29,9 +25,9 @@ static SPEC: Spec = Spec {
         1e8,
     )])],
     confused_with: &["saturation"],
-    inseparable_from: &[],
     experiment: Experiment::Rates,
     separate_by: "the same amplitude at a tenth of the frequency: a slew limit vanishes, a clip stays",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for SlewLimit {
@@ -50,9 +46,5 @@ impl EffectKind for SlewLimit {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([20.0, 60.0, 150.0, 350.0, 700.0, 1200.0, 2000.0, 8000.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }

@@ -5,29 +5,25 @@ use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, 
 
 /// Stuck until the flow reaches `break_um_per_s`, free until it falls below `stop_um_per_s`.
 pub fn stick_slip(break_um_per_s: f64, stop_um_per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[break_um_per_s, stop_um_per_s], &[])
+    Effect::new(&StickSlip, 0, &[break_um_per_s, stop_um_per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct StickSlip;
 
-pub(super) static KIND: StickSlip = StickSlip;
-
 static SPEC: Spec = Spec {
     id: "stick-slip",
     place: Place::Bead,
-    shown_at: "",
     equation: "stuck until |v| > break, free until |v| < stop",
     signature: "as adhesion, but full speed once free: memory",
-    ahead_of_plant: false,
     forms: &[Form::only(&[
         ParameterSpec::new("break_um_per_s", "um/s", 0.0, 1e6),
         ParameterSpec::new("stop_um_per_s", "um/s", 0.0, 1e6),
     ])],
     confused_with: &["wall-adhesion", "backlash"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "a slow triangle: adhesion moves slower than the flow, a slip at full speed once free",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for StickSlip {

@@ -7,12 +7,12 @@ use super::{
 
 /// Stiffening of the chip: the displacement that acts is `u + per_um2 u^3`, from the working point.
 pub fn stiffening(per_um2: f64) -> Effect {
-    Effect::new(&KIND, CUBE, &[per_um2], &[])
+    Effect::new(&Stiffening, CUBE, &[per_um2], &[])
 }
 
 /// The same by the square: `u + per_um u |u|`.
 pub fn stiffening_by_square(per_um: f64) -> Effect {
-    Effect::new(&KIND, SQUARE, &[per_um], &[])
+    Effect::new(&Stiffening, SQUARE, &[per_um], &[])
 }
 
 /// Indices of the forms.
@@ -30,12 +30,9 @@ fn power(form: usize) -> i32 {
 #[derive(Debug)]
 pub(super) struct Stiffening;
 
-pub(super) static KIND: Stiffening = Stiffening;
-
 static SPEC: Spec = Spec {
     id: "stiffening",
     place: Place::Chip,
-    shown_at: "",
     equation: "u + c u^3, or u + c u |u|",
     signature: "odd harmonics that grow with the square of the amplitude at all frequencies, no lag",
     ahead_of_plant: true,
@@ -50,9 +47,9 @@ static SPEC: Spec = Spec {
         },
     ],
     confused_with: &["pzt-hysteresis", "saturation"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "the same sine at three amplitudes: the third harmonic of a stiffening grows with the cube, at all frequencies alike",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for Stiffening {
@@ -96,10 +93,6 @@ impl EffectKind for Stiffening {
             .iter()
             .map(|c| vec![c / scope.stroke_um.powi(power).max(1e-6)])
             .collect()
-    }
-
-    fn build(&'static self, form: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, form, values, &[])
     }
 }
 

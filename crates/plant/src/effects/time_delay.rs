@@ -7,29 +7,25 @@ use super::{
 
 /// `y(t - delay)`.
 pub fn time_delay(delay_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[delay_s], &[])
+    Effect::new(&TimeDelay, 0, &[delay_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct TimeDelay;
 
-pub(super) static KIND: TimeDelay = TimeDelay;
-
 static SPEC: Spec = Spec {
     id: "time-delay",
     place: Place::Camera,
-    shown_at: "",
     equation: "y(t - delay)",
     signature: "phase in proportion to frequency, flat gain",
-    ahead_of_plant: false,
     // A heater or a tank may be minutes late.
     forms: &[Form::only(&[ParameterSpec::new(
         "delay_s", "s", 0.0, 3600.0,
     )])],
     confused_with: &["driver-lag", "exposure-averaging", "bubble"],
-    inseparable_from: &[],
     experiment: Experiment::Band,
     separate_by: "excite to 300 Hz: a pole rolls off, an exposure follows a sinc, a delay does neither",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for TimeDelay {
@@ -59,10 +55,6 @@ impl EffectKind for TimeDelay {
 
     fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
         one([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 20.0, 50.0].map(|k| k * scope.sample_s))
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {

@@ -8,21 +8,17 @@ use super::{
 
 /// The velocity is `1 + asymmetry` times as large outward and `1 - asymmetry` inward.
 pub fn valve_asymmetry(asymmetry: f64) -> Effect {
-    Effect::new(&KIND, 0, &[asymmetry], &[])
+    Effect::new(&ValveAsymmetry, 0, &[asymmetry], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct ValveAsymmetry;
 
-pub(super) static KIND: ValveAsymmetry = ValveAsymmetry;
-
 static SPEC: Spec = Spec {
     id: "valve-asymmetry",
     place: Place::Bead,
-    shown_at: "",
     equation: "v (1 + a sign v)",
     signature: "drift in proportion to the speed of motion, none at rest",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "asymmetry",
         "",
@@ -30,9 +26,9 @@ static SPEC: Spec = Spec {
         0.9,
     )])],
     confused_with: &["flow-drift", "leak"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "the same sine at two amplitudes and a rest: the drift of a valve goes with the speed of motion, that of a flow does not",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for ValveAsymmetry {
@@ -55,10 +51,6 @@ impl EffectKind for ValveAsymmetry {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([-0.01, 0.01])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

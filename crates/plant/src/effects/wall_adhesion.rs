@@ -8,21 +8,17 @@ use super::{
 
 /// Sticks to the wall unless the flow past it is faster than a threshold: a dead zone of the speed.
 pub fn wall_adhesion(speed_um_per_s: f64) -> Effect {
-    Effect::new(&KIND, 0, &[speed_um_per_s], &[])
+    Effect::new(&WallAdhesion, 0, &[speed_um_per_s], &[])
 }
 
 #[derive(Debug)]
 pub(super) struct WallAdhesion;
 
-pub(super) static KIND: WallAdhesion = WallAdhesion;
-
 static SPEC: Spec = Spec {
     id: "wall-adhesion",
     place: Place::Bead,
-    shown_at: "",
     equation: "v = sign(v0) max(|v0| - threshold, 0)",
     signature: "stuck plateaus at reversals; loss of gain at small amplitude; odd harmonics",
-    ahead_of_plant: false,
     forms: &[Form::only(&[ParameterSpec::new(
         "speed_um_per_s",
         "um/s",
@@ -30,9 +26,9 @@ static SPEC: Spec = Spec {
         1e6,
     )])],
     confused_with: &["backlash", "pzt-hysteresis"],
-    inseparable_from: &[],
     experiment: Experiment::Amplitudes,
     separate_by: "an amplitude sweep: the lag of backlash shrinks to nothing, hysteresis grows, adhesion stops the bead at small amplitude; a dead zone of the driver does the same behind a plant whose speed follows the command: measure the displacement of the piezo itself",
+    ..Spec::PLAIN
 };
 
 impl EffectKind for WallAdhesion {
@@ -59,10 +55,6 @@ impl EffectKind for WallAdhesion {
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
         one([2.0, 6.0, 20.0, 50.0, 120.0])
-    }
-
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        Effect::new(self, 0, values, &[])
     }
 }
 

@@ -5,7 +5,7 @@ use super::*;
 use crate::arming::ArmingConfig;
 use crate::core::Core;
 use crate::life::{Event, Request};
-use crate::recorder::{Feed, Recorder, RecorderReport, Unconfirmed};
+use crate::recorder::{Recorder, RecorderReport, Unconfirmed};
 use crate::reference::{ReferenceInput, ReferenceOutput, Stage};
 use crate::replay::Replay;
 use crate::run::{RunSink, close_session};

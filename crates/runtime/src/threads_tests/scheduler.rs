@@ -282,11 +282,7 @@ pub(super) fn run(seed: u64, periods: u64, faults: &Faults, asks: &[(i64, Reques
     let (seen_in, seen) = RingBuffer::new(1024);
     let mut sink = sink(faults, start_ns, recorder_clock);
     let mut statistics = Statistics::default();
-    let feed = Feed {
-        records: ends.records,
-        events: ends.events,
-        learned: ends.learned,
-    };
+    let feed = ends.feed;
     let (shared, operator) = (Shared::default(), Operator::default());
     let mut source = source(seed, faults, &rig, camera_clock);
     let rule = EndRule {

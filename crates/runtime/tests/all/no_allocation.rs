@@ -55,8 +55,8 @@ fn allocations_per_run(kind: ControllerKind) -> (u64, usize) {
                 applied_um = command_um;
             }
         }
-        while ends.records.pop().is_ok() {}
-        while ends.events.pop().is_ok() {}
+        while ends.feed.records.pop().is_ok() {}
+        while ends.feed.events.pop().is_ok() {}
     }
     (allocations() - before, ran)
 }

@@ -1,13 +1,12 @@
 //! A bead on the glass, stronger than the one that swims: the run takes the one that moves with the PZT.
 
-use crate::common::hold;
+use crate::common::{hold, run_on};
 use cellpos_emulator::EmulatedRig;
-use cellpos_plant::Model;
 use cellpos_rig::{Camera, CameraError, Clock, FrameBuffer, FrameStamp, SourceInfo};
 use cellpos_runtime::life::{EventKind, Refusal};
-use cellpos_runtime::{EndRule, Event, RunSink, Statistics, TickRecord};
-use cellpos_session::rig_file::{ClockKind, Frames};
-use cellpos_session::{EndKind, Options, Rig, RigFile};
+use cellpos_runtime::{Event, RunSink, Statistics, TickRecord};
+use cellpos_session::rig_file::Frames;
+use cellpos_session::{EndKind, RigFile};
 use cellpos_vision::Template;
 
 /// A camera in whose pictures a bead lies on the glass.
@@ -67,40 +66,19 @@ fn run(places_px: &[(f64, f64)], alone: bool) -> (cellpos_session::Ended, Kept) 
     let mut file = RigFile::default();
     file.emulator.start_um = 3.0;
     file.emulator.height_px = 96;
-    let clock = Clock::virtual_at(0);
-    let model = Model::load("eq6").expect("built in");
-    let emulated = EmulatedRig::new(file.board, &file.emulator, &model, clock.clone());
-    let emulated = emulated.expect("the default rig");
-    let camera = Glass {
-        inner: emulated.camera(),
-        template: file
-            .localiser()
-            .expect("the default look")
-            .template()
-            .clone(),
-        places_px: places_px.to_vec(),
-        alone,
+    let places_px = places_px.to_vec();
+    let source = |file: &RigFile, emulated: &EmulatedRig, clock: &Clock| {
+        let localiser = file.localiser().expect("the default look");
+        let camera = Glass {
+            inner: emulated.camera(),
+            template: localiser.template().clone(),
+            places_px,
+            alone,
+        };
+        file.watch(camera, clock).expect("a camera")
     };
-    let source = file.watch(camera, &clock).expect("a camera");
-    let board = Box::new(emulated.actuator().expect("it answers"));
-    let options = Options {
-        clock: ClockKind::Virtual,
-        frames: Frames::On,
-        best_effort: true,
-    };
-    let rig = Rig::with_devices(file, options, source, board, clock);
-    let mut rig = rig.expect("the nominal model");
-    let prepared = rig.prepare("eq6", "pi").expect("a PI for Eq. (6)");
-    let setup = rig.set_up(prepared, hold()).expect("the PZT stands");
-    let core = setup.core().expect("a loop");
-    let end = EndRule {
-        ticks: Some(3000),
-        ..EndRule::default()
-    };
-    let armed = rig.arm(&setup, core, Kept::default(), end).ok();
-    let finished = armed.expect("armed").start().and_then(|run| run.wait());
-    let finished = finished.expect("a run");
-    (finished.ended, finished.sink)
+    let ran = run_on(source, file, Frames::On, "pi", hold(), 3000);
+    (ran.ended, ran.sink)
 }
 
 #[test]

@@ -74,16 +74,30 @@ impl Motion {
             .filter(|(_, um)| um.is_finite())
             .collect();
         let rows = increments.len() as f64;
-        let of_delay = |delay: f64| {
-            let (whole, part) = (delay.floor() as usize, delay.fract());
-            let (mut u, mut uu, mut y, mut uy, mut yy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let y: f64 = increments.iter().map(|(_, um)| um).sum();
+        let yy: f64 = increments.iter().map(|(_, um)| um * um).sum();
+        // A delay between two rows mixes their commands, so that the sums of all delays follow from those of the rows.
+        let sums = |whole: usize| {
+            let mut sums = [0.0; 7];
             for &(row, um) in &increments {
-                let held = command_um[row - whole];
-                let command = held + part * (command_um[row - whole - 1] - held);
-                (u, uu, y) = (u + command, uu + command * command, y + um);
-                (uy, yy) = (uy + command * um, yy + um * um);
+                let (a, b) = (command_um[row - whole], command_um[row - whole - 1]);
+                let parts = [a, b, a * a, a * b, b * b, a * um, b * um];
+                sums.iter_mut()
+                    .zip(parts)
+                    .for_each(|(sum, part)| *sum += part);
             }
-            let (variance, shared) = (uu - u * u / rows, uy - u * y / rows);
+            sums
+        };
+        let mut of_rows = (usize::MAX, [0.0; 7]);
+        let of_delay = |delay: f64| {
+            let (whole, p) = (delay.floor() as usize, delay.fract());
+            if of_rows.0 != whole {
+                of_rows = (whole, sums(whole));
+            }
+            let ([a, b, aa, ab, bb, ay, by], q) = (of_rows.1, 1.0 - p);
+            let u = q * a + p * b;
+            let variance = q * q * aa + 2.0 * p * q * ab + p * p * bb - u * u / rows;
+            let shared = q * ay + p * by - u * y / rows;
             let gain = shared / variance;
             (Self { gain, delay }, yy - y * y / rows - gain * shared)
         };

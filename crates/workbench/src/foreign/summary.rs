@@ -13,7 +13,7 @@ use cellpos_ident::sampled::Hold;
 use cellpos_numeric::statistics::Z95;
 use cellpos_plant::Model;
 use cellpos_report::{
-    Axis, Column, Emphasis, Figure, Panel, Report, Series, Table, log_grid, number, with_interval,
+    Column, Emphasis, Figure, Report, Series, Table, log_grid, number, with_interval,
 };
 use cellpos_session::Failure;
 use serde_json::{Value, json};
@@ -187,9 +187,15 @@ fn model_verdict(m: &RationalFit) -> &'static str {
     }
 }
 
-/// The delay with its 95 % interval, ms.
-fn delay_ms(m: &RationalFit) -> String {
-    with_interval(m.delay_s * 1e3, 1e3 * Z95 * m.delay_sd_s)
+/// The model's order and numbers, with their 95 % intervals.
+fn numbers_of(m: &RationalFit) -> String {
+    format!(
+        "model of order {}: num {}, den {}, delay {} ms",
+        m.order,
+        coefficients(&m.numerator, &m.numerator_sd),
+        coefficients(&m.denominator, &m.denominator_sd),
+        with_interval(m.delay_s * 1e3, 1e3 * Z95 * m.delay_sd_s)
+    )
 }
 
 /// What a record tells, as JSON.
@@ -277,15 +283,7 @@ pub fn to_text(path: &Path, r: &ForeignResult, with_model: bool) -> String {
     if !with_model {
         // The base model of all records stands below.
     } else if let Some(m) = r.models.first() {
-        let _ = writeln!(
-            out,
-            "  linear model of order {}: num {}, den {}, delay {} ms: {}",
-            m.order,
-            coefficients(&m.numerator, &m.numerator_sd),
-            coefficients(&m.denominator, &m.denominator_sd),
-            delay_ms(m),
-            model_verdict(m)
-        );
+        let _ = writeln!(out, "  linear {}: {}", numbers_of(m), model_verdict(m));
     } else if !matches!(r.basis, Basis::Nothing { .. }) {
         let _ = writeln!(out, "  {}", no_model(r));
     }
@@ -326,11 +324,8 @@ pub fn report(results: &[(PathBuf, ForeignResult)], base: Option<&Base>) -> Repo
             _ if base.is_some() => {}
             Some(m) => {
                 report.paragraph(&format!(
-                    "Linear model of order {}: num {}, den {}, delay {} ms (95 % intervals): {}.",
-                    m.order,
-                    coefficients(&m.numerator, &m.numerator_sd),
-                    coefficients(&m.denominator, &m.denominator_sd),
-                    delay_ms(m),
+                    "Linear {} (95 % intervals): {}.",
+                    numbers_of(m),
                     model_verdict(m)
                 ));
             }
@@ -391,27 +386,23 @@ fn bode(index: usize, r: &ForeignResult) -> Figure {
     let low = f.iter().copied().fold(f64::INFINITY, f64::min);
     let high = f.iter().copied().fold(0.0, f64::max);
     let grid = log_grid(0.5 * low, (2.0 * high).min(0.49 / r.sampling.period_s), 200);
-    let figure = Figure::new(
+    let mut figure = Figure::bode(
         &format!("bode-{}", index + 1),
         "Response in the record and the chosen linear model with delay.",
     )
-    .share_x();
-    let mut panels = [
-        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("gain", "dB"))
-            .series(Series::points("record", &f, &gain)),
-        Panel::new(Axis::log("frequency", "Hz"), Axis::linear("phase", "deg"))
-            .series(Series::points("record", &f, &phase)),
-    ];
+    .bode_series(
+        Series::points("record", &f, &gain),
+        Series::points("record", &f, &phase),
+    );
     if let Some(m) = r.models.first() {
-        let curve: Vec<_> = grid
-            .iter()
-            .map(|&f| m.sampled_response(f, r.sampling))
-            .collect();
-        let g: Vec<f64> = curve.iter().map(|c| 20.0 * c.norm().log10()).collect();
-        let p: Vec<f64> = curve.iter().map(|c| c.arg().to_degrees()).collect();
-        panels[0] = panels[0].clone().series(Series::line("model", &grid, &g));
-        panels[1] = panels[1].clone().series(Series::line("model", &grid, &p));
+        let curve = grid.iter().map(|&f| m.sampled_response(f, r.sampling));
+        let (g, p): (Vec<f64>, Vec<f64>) = curve
+            .map(|c| (20.0 * c.norm().log10(), c.arg().to_degrees()))
+            .unzip();
+        figure = figure.bode_series(
+            Series::line("model", &grid, &g),
+            Series::line("model", &grid, &p),
+        );
     }
-    let [upper, lower] = panels;
-    figure.panel(upper).panel(lower)
+    figure
 }

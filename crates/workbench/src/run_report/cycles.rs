@@ -16,79 +16,41 @@ struct Quantity {
 /// Those that the first figure of a cell shows.
 const OF_THE_CELL: [&str; 3] = ["stretch", "length at cycle start", "recovery time"];
 
+const fn quantity(
+    of_what: &'static str,
+    name: &'static str,
+    unit: &'static str,
+    of: fn(&CycleRow, &AtRest) -> f64,
+) -> Quantity {
+    Quantity {
+        of_what,
+        name,
+        unit,
+        of,
+    }
+}
+
 const QUANTITIES: [Quantity; 12] = [
-    Quantity {
-        of_what: "rig",
-        name: "reached over commanded amplitude",
-        unit: "",
-        of: |row, _| row.reached_um / row.commanded_um,
-    },
-    Quantity {
-        of_what: "rig",
-        name: "lag",
-        unit: "deg",
-        of: |row, _| row.lag_deg,
-    },
-    Quantity {
-        of_what: "rig",
-        name: "bias",
-        unit: "um",
-        of: |row, _| row.bias_um,
-    },
-    Quantity {
-        of_what: "rig",
-        name: "error RMS",
-        unit: "um",
-        of: |row, _| row.rms_um,
-    },
-    Quantity {
-        of_what: "rig",
-        name: "neutral",
-        unit: "um",
-        of: |row, _| row.neutral_um,
-    },
-    Quantity {
-        of_what: "bead",
-        name: "gain",
-        unit: "1/s",
-        of: |row, _| row.gain_per_s,
-    },
-    Quantity {
-        of_what: "cell",
-        name: "dwell",
-        unit: "s",
-        of: |row, _| row.dwell_s,
-    },
-    Quantity {
-        of_what: "cell",
-        name: "stretch",
-        unit: "",
-        of: |row, rest| rest.stretch(row),
-    },
-    Quantity {
-        of_what: "cell",
-        name: "areal stretch",
-        unit: "",
-        of: |row, rest| rest.areal_stretch(row),
-    },
-    Quantity {
-        of_what: "cell",
-        name: "length at cycle start",
-        unit: "um",
-        of: |row, _| row.length_start_um,
-    },
-    Quantity {
-        of_what: "cell",
-        name: "area at cycle start",
-        unit: "um^2",
-        of: |row, _| row.area_start_um2,
-    },
-    Quantity {
-        of_what: "cell",
-        name: "recovery time",
-        unit: "s",
-        of: |row, _| row.recovery_s,
-    },
+    quantity("rig", "reached over commanded amplitude", "", |row, _| {
+        row.reached_um / row.commanded_um
+    }),
+    quantity("rig", "lag", "deg", |row, _| row.lag_deg),
+    quantity("rig", "bias", "um", |row, _| row.bias_um),
+    quantity("rig", "error RMS", "um", |row, _| row.rms_um),
+    quantity("rig", "neutral", "um", |row, _| row.neutral_um),
+    quantity("bead", "gain", "1/s", |row, _| row.gain_per_s),
+    quantity("cell", "dwell", "s", |row, _| row.dwell_s),
+    quantity("cell", "stretch", "", |row, rest| rest.stretch(row)),
+    quantity("cell", "areal stretch", "", |row, rest| {
+        rest.areal_stretch(row)
+    }),
+    quantity("cell", "length at cycle start", "um", |row, _| {
+        row.length_start_um
+    }),
+    quantity("cell", "area at cycle start", "um^2", |row, _| {
+        row.area_start_um2
+    }),
+    quantity("cell", "recovery time", "s", |row, _| row.recovery_s),
 ];
 
 /// Adds the section; gives the trends as they go into the JSON. `of_a_cell`: stretch, length and recovery have a figure of their own.

@@ -2,6 +2,7 @@
 
 use super::cycles::{on_the_way, was_elsewhere};
 use super::ticks::{Course, Ticks};
+use super::traces::over_time;
 use cellpos_report::{Axis, Figure, Panel, Report, Series};
 use cellpos_script::{ArmKind, AtRest, CycleFlags, CycleRow, Mean};
 
@@ -66,29 +67,12 @@ pub(super) fn section(page: &mut Report, rows: &[CycleRow], ticks: &Ticks) {
         return;
     }
     page.section("The cell over its cycles");
-    let course = ticks.length.course(0);
-    let mut length = Panel::new(Axis::linear("time", "s"), Axis::linear("length", "um"));
-    if !ticks.length.is_bare() {
-        let band = Series::band(
-            "smallest to largest",
-            &course.time_s,
-            &course.low,
-            &course.high,
-        );
-        length = length.series(band.color(0));
-    }
     page.figure(
         Figure::new(
             "length",
             "Length of the cell over the whole run: median of each stretch of time, and envelope.",
         )
-        .panel(
-            length.series(
-                Series::line("median", &course.time_s, &course.median)
-                    .color(0)
-                    .thin(),
-            ),
-        ),
+        .panel(over_time(&ticks.length, "length", "um")),
     );
     let mut panel = Panel::new(
         Axis::linear("time since the cycle began", "s"),

@@ -1,5 +1,6 @@
 //! Traces and spectrum of a run.
 
+use super::envelope::Envelope;
 use super::ticks::Ticks;
 use cellpos_record::RunMeta;
 use cellpos_report::{Axis, Figure, Panel, Report, Series};
@@ -50,25 +51,28 @@ pub(super) fn position(ticks: &Ticks) -> Panel {
     }
 }
 
-/// The error over the run, tick by tick or as an envelope with its median.
+/// A quantity over the run, tick by tick or as an envelope with its median.
+pub(super) fn over_time(envelope: &Envelope<1>, name: &str, unit: &str) -> Panel {
+    let course = envelope.course(0);
+    let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear(name, unit));
+    if !envelope.is_bare() {
+        let (low, high) = (&course.low, &course.high);
+        let band = Series::band("smallest to largest", &course.time_s, low, high);
+        panel = panel.series(band.color(0));
+    }
+    let median = Series::line("median", &course.time_s, &course.median);
+    panel.series(median.color(0).thin())
+}
+
+/// The error over the run.
 pub(super) fn error(ticks: &Ticks) -> Figure {
-    let course = ticks.error.course(0);
-    let mut panel = Panel::new(Axis::linear("time", "s"), Axis::linear("error", "nm"));
     let mut caption = "Error from two seconds after the loop was closed.".to_string();
     if !ticks.error.is_bare() {
-        let band = Series::band(
-            "smallest to largest",
-            &course.time_s,
-            &course.low,
-            &course.high,
-        );
-        panel = panel.series(band.color(0));
         caption.push_str(
             " Area: from the smallest to the largest of each stretch of time; line: median.",
         );
     }
-    let median = Series::line("median", &course.time_s, &course.median);
-    Figure::new("error-over-time", &caption).panel(panel.series(median.color(0).thin()))
+    Figure::new("error-over-time", &caption).panel(over_time(&ticks.error, "error", "nm"))
 }
 
 /// Position and target, PZT and zero flow over the whole run.

@@ -48,7 +48,7 @@ pub(super) fn run(args: &Args, cells: u64) -> CommandResult {
     // What is wrong with script, rig or model is wrong for every cell.
     let first = fresh(args)?;
     let live = first.clock == ClockKind::Real;
-    let folder = folder(&args.runs, &first.name)?;
+    let folder = folder(&args.run.runs, &first.name)?;
     let mut queue = Queue {
         folder,
         name: first.name,
@@ -142,9 +142,6 @@ impl Queue {
             self.name.chars().take(58).collect::<String>()
         );
         ready.runs.clone_from(&self.folder);
-        if let Some(near) = args.near {
-            ready.file.near_um = Some(near.value());
-        }
         // The emulated rig has another cell each time.
         let seed = &mut ready.file.emulator.seed;
         *seed = seed.wrapping_add(1000 * (number - 1) + tries);
