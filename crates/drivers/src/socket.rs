@@ -30,7 +30,7 @@ pub struct SocketCamera {
 }
 
 impl SocketCamera {
-    /// Connects, and waits for the first frame to learn its size.
+    /// Connects, and waits for the first frame to learn its size and its exposure.
     ///
     /// # Errors
     /// Nobody serves the socket, or the data are not a camera stream.
@@ -59,18 +59,20 @@ impl SocketCamera {
                 height_px: 0,
                 rate_hz,
                 latency_ms,
+                exposure_s: 0.0,
                 field_um: [0.0, 0.0],
             },
         };
         let mut buffer = FrameBuffer::default();
         let deadline_ns = monotonic_ns() + patience.as_nanos() as i64;
-        if camera.next_frame(&mut buffer, deadline_ns)?.is_none() {
+        let Some(first) = camera.next_frame(&mut buffer, deadline_ns)? else {
             return Err(CameraError::Broken {
                 camera: path.display().to_string(),
                 problem: format!("no frame within {patience:?}"),
                 remedy: "start the acquisition".to_string(),
             });
-        }
+        };
+        camera.info.exposure_s = first.exposure_ns as f64 * 1e-9;
         camera.info.width_px = buffer.width;
         camera.info.height_px = buffer.height;
         Ok(camera)

@@ -176,6 +176,7 @@ impl EmulatedRig {
             },
             rate_hz: config.rate_hz,
             latency_ms: config.latency_ms,
+            exposure_s: config.exposure_ms * 1e-3,
             field_um: [-half_um, half_um],
         }
     }

@@ -375,6 +375,7 @@ impl Camera for SceneCamera {
             height_px: self.config.height_px,
             rate_hz: self.config.rate_hz,
             latency_ms: 0.0,
+            exposure_s: 0.0,
             field_um: [0.0, 0.0],
         }
     }

@@ -100,6 +100,9 @@ pub struct SourceInfo {
     pub rate_hz: f64,
     /// From the middle of an exposure to its arrival, as configured, ms.
     pub latency_ms: f64,
+    /// Length of an exposure as the camera reports it, s; 0 if it does not. The controller that a run records has it.
+    #[serde(skip)]
+    pub exposure_s: f64,
     /// Lowest and highest position that can be seen, um.
     pub field_um: [f64; 2],
 }

@@ -3,7 +3,7 @@
 use crate::Failure;
 use crate::ended::Ended;
 pub use crate::failure::describe;
-pub use crate::fit::{prepare, stated_exposure_s};
+pub use crate::fit::{known_exposure_s, prepare, stated_exposure_s};
 use crate::frames_seen::FrameAge;
 use crate::provenance;
 use crate::rig::{Finished, Rig};

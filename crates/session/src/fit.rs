@@ -7,6 +7,7 @@ use crate::setup;
 use cellpos_control::ControllerKind;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Action;
+use cellpos_rig::SourceInfo;
 
 /// Narrows the controller's limits to those of rig file and board, and MPC's positions to the field of view. Passes exposure and
 /// frame rate to the estimator.
@@ -16,7 +17,7 @@ pub(crate) fn narrow(setup: &mut Prepared, file: &RigFile, rig: &Connected) {
     let asked = setup::within(file.limits, [own.low_um, own.high_um, own.slew_um_per_s]);
     setup.controller.limits =
         setup::within(asked, [board.low_um, board.high_um, board.slew_um_per_s]);
-    let exposure_ms = 1e3 * exposure_s(file, &setup.model);
+    let exposure_ms = 1e3 * exposure_s(file, &rig.source.info(), &setup.model);
     let estimator = &mut setup.controller.estimator;
     if estimator.ticks_per_fix == 1.0 {
         estimator.ticks_per_fix = ticks_per_fix(file.timing.period_us, rig.source.info().rate_hz);
@@ -76,15 +77,23 @@ pub fn stated_exposure_s(file: &RigFile) -> Option<f64> {
     }
 }
 
-/// Exposure of a frame, s, from the rig file, else from the model; 0 if neither states it.
-fn exposure_s(file: &RigFile, model: &Model) -> f64 {
+/// The same; else as the camera reports it.
+pub fn known_exposure_s(file: &RigFile, camera: &SourceInfo) -> Option<f64> {
+    let reported_s = Some(camera.exposure_s).filter(|s| *s > 0.0);
+    stated_exposure_s(file).or(reported_s)
+}
+
+/// Exposure of a frame, s, from rig file or camera, else from the model; 0 if none states it.
+fn exposure_s(file: &RigFile, camera: &SourceInfo, model: &Model) -> f64 {
     let of_model = || {
         model.effects.iter().find_map(|effect| match effect.act() {
             Action::Exposure(exposure_s) => Some(exposure_s),
             _ => None,
         })
     };
-    stated_exposure_s(file).or_else(of_model).unwrap_or(0.0)
+    known_exposure_s(file, camera)
+        .or_else(of_model)
+        .unwrap_or(0.0)
 }
 
 /// Model and controller from their options, before a board is known.

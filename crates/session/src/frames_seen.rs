@@ -161,6 +161,7 @@ mod tests {
                 height_px: 0,
                 rate_hz: 1000.0,
                 latency_ms: 0.0,
+                exposure_s: 0.0,
                 field_um: [-10.0, 10.0],
             }
         }

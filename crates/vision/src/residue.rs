@@ -447,7 +447,8 @@ mod tests {
         template.draw(&mut grey, SIDE, AT.0, AT.1, 400.0);
         let mut state = 7 + residues.fixes * u64::from(is_new);
         let mut uniform = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005) + 1_442_695_040_888_963_407;
+            state = (state.wrapping_mul(6_364_136_223_846_793_005))
+                .wrapping_add(1_442_695_040_888_963_407);
             (state >> 33) as f64 / (1_u64 << 31) as f64 - 0.5
         };
         let mut normal = || (0..12).map(|_| uniform()).sum::<f64>();

@@ -79,6 +79,7 @@ impl Camera for SpotCamera {
             height_px: HEIGHT,
             rate_hz: 1e9 / PERIOD_NS as f64,
             latency_ms: LATENCY_NS as f64 * 1e-6,
+            exposure_s: 0.0,
             field_um: [-half_um, half_um],
         }
     }

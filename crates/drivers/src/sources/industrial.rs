@@ -188,6 +188,7 @@ impl IndustrialCamera {
             height_px: usize::try_from(height).unwrap_or(0),
             rate_hz: settings.rate_hz,
             latency_ms: settings.latency_ms,
+            exposure_s: 0.0,
             field_um: [0.0, 0.0],
         };
         let account = account(kind, settings.rate_hz);

@@ -103,6 +103,7 @@ impl Camera for Playback {
             height_px,
             rate_hz: self.rate_hz,
             latency_ms: 0.0,
+            exposure_s: 0.0,
             field_um: [0.0, 0.0],
         }
     }

@@ -89,6 +89,7 @@ impl Camera for Scripted {
             height_px: HEIGHT,
             rate_hz: self.rate_hz,
             latency_ms: 2.0,
+            exposure_s: 0.0,
             field_um: [0.0, 0.0],
         }
     }

@@ -394,6 +394,7 @@ impl PositionSource for Source {
             height_px: 0,
             rate_hz: self.faults.camera_hz,
             latency_ms: 2.0,
+            exposure_s: 0.0,
             field_um: [-50.0, 50.0],
         }
     }

@@ -8,7 +8,6 @@ use cellpos_ident::experiment::Plan;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
 use cellpos_session::Failure;
-use cellpos_session::connect::stated_exposure_s;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -115,7 +114,6 @@ fn run_plan(
     file: &Path,
     progress: &mut (dyn FnMut(f64) + Send),
 ) -> Result<Ran, Failure> {
-    let exposure_s = stated_exposure_s(&rig.file).unwrap_or(0.0);
     let mut rig = rig.clone();
     let (mut again, mut segments) = (Again::of(plan), Vec::new());
     let mut records: Vec<(PathBuf, Record)> = Vec::new();
@@ -125,7 +123,7 @@ fn run_plan(
         let todo = again.missing(&segments);
         let file = free_path(file);
         let keep = |so_far: &Acquired| {
-            let record = record(so_far, &file, plan.period_s, exposure_s)?;
+            let record = record(so_far, &file, plan.period_s)?;
             write_record(&record, &file).map(|()| record)
         };
         let mut heard = |ticks: usize| progress((done + ticks as f64 / total).min(1.0));
@@ -209,12 +207,7 @@ pub fn record_name(file: &Path) -> String {
 }
 
 /// A run as a record.
-fn record(
-    acquired: &Acquired,
-    file: &Path,
-    period_s: f64,
-    exposure_s: f64,
-) -> Result<Record, Failure> {
+fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Failure> {
     let (pzt_um, bead_um) = &acquired.rows;
     let time_s: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * period_s).collect();
     let mut record =
@@ -222,7 +215,7 @@ fn record(
     record.unseen.clone_from(&acquired.unseen);
     record.frame_age_s.clone_from(&acquired.frame_age_s);
     record.late_command.clone_from(&acquired.late_command);
-    record.exposure_s = exposure_s;
+    record.exposure_s = acquired.exposure_s;
     Ok(record)
 }
 

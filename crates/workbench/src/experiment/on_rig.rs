@@ -72,6 +72,8 @@ pub struct Acquired {
     pub late_command: Vec<bool>,
     /// Places in the plan of the segments in which the bead left the view.
     pub out_of_view: Vec<usize>,
+    /// Length of an exposure, s; 0 if neither rig file nor camera states it.
+    pub exposure_s: f64,
     /// Why segments are missing, if any are.
     pub trouble: Option<Trouble>,
     /// Folder of the run.
@@ -260,6 +262,7 @@ impl OnRig {
         file.partner = None;
         let mut rig = Rig::open(file, self.options())?;
         let board = rig.actuator().name;
+        let exposure_s = connect::known_exposure_s(&self.file, &rig.source()).unwrap_or(0.0);
         let mut prepared = Prepared {
             model: self.model.clone(),
             controller: self.controller,
@@ -303,7 +306,12 @@ impl OnRig {
             let now = ended_spans(&ticks, &schedule.spans);
             if now > ended {
                 ended = now;
-                (listener.segment)(&self.acquired(&ticks, plan, &schedule.spans, &board));
+                (listener.segment)(&self.acquired(
+                    &ticks,
+                    plan,
+                    &schedule.spans,
+                    (&board, exposure_s),
+                ));
             }
         })?;
         let over = matches!(
@@ -335,7 +343,7 @@ impl OnRig {
         if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
             return Err(other_rate(rate_hz, period_ns));
         }
-        let mut acquired = self.acquired(&ticks, plan, &schedule.spans, &board);
+        let mut acquired = self.acquired(&ticks, plan, &schedule.spans, (&board, exposure_s));
         acquired.run = run;
         let (done, of) = (acquired.records.len(), schedule.spans.len());
         acquired.trouble = if done == of {
@@ -364,7 +372,13 @@ impl OnRig {
     }
 
     /// The result of the ticks so far.
-    fn acquired(&self, ticks: &[TickRecord], plan: &Plan, spans: &[Span], board: &str) -> Acquired {
+    fn acquired(
+        &self,
+        ticks: &[TickRecord],
+        plan: &Plan,
+        spans: &[Span],
+        (board, exposure_s): (&str, f64),
+    ) -> Acquired {
         let rows = self.rows(ticks);
         let (mut records, mut out_of_view) = (Vec::new(), Vec::new());
         for span in spans {
@@ -387,6 +401,7 @@ impl OnRig {
             late_command: rows.stalled,
             unseen: rows.unseen,
             out_of_view,
+            exposure_s,
             trouble: None,
             run: None,
             board: board.to_owned(),

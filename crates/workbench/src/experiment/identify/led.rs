@@ -236,6 +236,7 @@ mod tests {
                 height_px: 0,
                 rate_hz: 1000.0,
                 latency_ms: 1.0,
+                exposure_s: 0.0,
                 field_um: [-1.0, 1.0],
             }
         }
