@@ -230,6 +230,7 @@ mod tests {
         let mut camera = SocketCamera::connect(&path, 1000.0, 2.0, Duration::from_secs(5))
             .expect("the first frame comes");
         assert_eq!((camera.info().width_px, camera.info().height_px), (4, 2));
+        assert!((camera.info().exposure_s - 5e-4).abs() < 1e-12);
         let mut buffer = FrameBuffer::default();
         let deadline_ns = monotonic_ns() + 5_000_000_000;
         let stamp = camera

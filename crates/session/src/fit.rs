@@ -150,4 +150,26 @@ mod tests {
         model.working_point_um = 21.0;
         assert_eq!(begins(&RigFile::default(), &model), 20.0);
     }
+
+    #[test]
+    fn an_exposure_that_no_file_states_is_the_one_that_the_camera_reports() {
+        let mut file: RigFile =
+            toml::from_str("[camera]\nkind = \"socket\"\nsocket = \"c.sock\"").unwrap();
+        let reporting = |exposure_s| SourceInfo {
+            name: "camera".to_owned(),
+            width_px: 64,
+            height_px: 64,
+            rate_hz: 1000.0,
+            latency_ms: 2.0,
+            exposure_s,
+            field_um: [-3.0, 3.0],
+        };
+        let blurred = Model::eq6().with_effect(cellpos_plant::effects::exposure_averaging(2e-4));
+        assert_eq!(exposure_s(&file, &reporting(5e-4), &blurred), 5e-4);
+        assert_eq!(exposure_s(&file, &reporting(0.0), &blurred), 2e-4);
+        assert_eq!(exposure_s(&file, &reporting(0.0), &Model::eq6()), 0.0);
+        file.camera = CameraConfig::Emulated {};
+        let stated_s = file.emulator.exposure_ms * 1e-3;
+        assert_eq!(exposure_s(&file, &reporting(1e-4), &blurred), stated_s);
+    }
 }

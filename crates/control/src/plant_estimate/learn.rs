@@ -78,7 +78,7 @@ impl Adapter {
             }
             let at_um = state.model.at(aligned, age)?;
             let chosen_um = state.instrument.at(aligned, age)?;
-            Some((fix, age, self.frame(aligned.first(delay)), at_um, chosen_um))
+            Some((fix, age, self.frame(aligned), at_um, chosen_um))
         });
         let Some((fix, ago, frame, at_um, chosen_um)) = known else {
             state.silent = state.silent.saturating_add(1);

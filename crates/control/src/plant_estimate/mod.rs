@@ -274,12 +274,12 @@ impl Adapter {
         state.force.log_gain.exp() * seen.unwrap_or(0.0)
     }
 
-    /// What a frame shows of the lags, with the design's delay at `first`.
-    fn frame(&self, first: f64) -> Frame {
+    /// What the frames show of the lags, as they are aligned.
+    fn frame(&self, aligned: &Alignment) -> Frame {
         Frame {
-            first,
+            first: aligned.first(self.delay_samples),
             jump: self.jump,
-            exposure: self.exposure_ticks,
+            exposure: aligned.spread(self.exposure_ticks),
         }
     }
 

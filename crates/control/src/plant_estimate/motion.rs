@@ -23,6 +23,8 @@ pub(super) struct Alignment {
     /// Age of a fix that is usual, and whole ticks from its exposure to lag 0, ticks.
     usual: f64,
     whole: f64,
+    /// Mean square of the ages about the usual one, but for whole ticks, ticks^2.
+    scatter: f64,
 }
 
 impl Alignment {
@@ -31,13 +33,17 @@ impl Alignment {
         Self {
             usual: age,
             whole: (delay + age).floor(),
+            scatter: 0.0,
         }
     }
 
     /// Takes the age of a fix into the usual one, over a block of fixes. Whether the series still have the usual fix within half a tick.
     #[must_use]
     pub(super) fn follow(&mut self, delay: f64, age: f64) -> bool {
-        self.usual += (age - self.usual).clamp(-0.5, 0.5) / f64::from(BLOCK);
+        let off = age - self.usual;
+        let part = off - off.round();
+        self.scatter += (part * part - self.scatter) / f64::from(BLOCK);
+        self.usual += off.clamp(-0.5, 0.5) / f64::from(BLOCK);
         (self.first(delay) - 0.5).abs() < 1.0
     }
 
@@ -46,9 +52,16 @@ impl Alignment {
         delay + self.usual - self.whole
     }
 
-    /// Age of the model's position for a lag and a fix of this age, ticks.
+    /// Time over which the exposures of fixes are spread, ticks: that of each, and the scatter of their ages. Variances of times add, and
+    /// that of an exposure is a twelfth of its square.
+    pub(super) fn spread(&self, exposure: f64) -> f64 {
+        (exposure * exposure + 12.0 * self.scatter).sqrt()
+    }
+
+    /// Age of the model's position for a lag and a fix of this age, whole ticks: a fix may come ticks late. The rest of the ages is in
+    /// [`Alignment::spread`].
     fn ago(&self, lag: f64, age: f64) -> f64 {
-        self.whole + lag + age - self.usual
+        self.whole + lag + (age - self.usual).round()
     }
 }
 
