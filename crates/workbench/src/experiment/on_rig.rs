@@ -50,6 +50,22 @@ pub struct OnRig {
     pub record_in: Option<PathBuf>,
 }
 
+/// What board and camera say of themselves.
+struct Devices {
+    board: String,
+    /// As [`Acquired::exposure_s`].
+    exposure_s: f64,
+}
+
+impl Devices {
+    fn of(rig: &Rig, file: &RigFile) -> Self {
+        Self {
+            board: rig.actuator().name,
+            exposure_s: connect::known_exposure_s(file, &rig.source()).unwrap_or(0.0),
+        }
+    }
+}
+
 /// What a run gave.
 pub struct Acquired {
     /// The segments without a long loss of the bead.
@@ -261,8 +277,7 @@ impl OnRig {
         let mut file = self.file.clone();
         file.partner = None;
         let mut rig = Rig::open(file, self.options())?;
-        let board = rig.actuator().name;
-        let exposure_s = connect::known_exposure_s(&self.file, &rig.source()).unwrap_or(0.0);
+        let devices = Devices::of(&rig, &self.file);
         let mut prepared = Prepared {
             model: self.model.clone(),
             controller: self.controller,
@@ -306,12 +321,7 @@ impl OnRig {
             let now = ended_spans(&ticks, &schedule.spans);
             if now > ended {
                 ended = now;
-                (listener.segment)(&self.acquired(
-                    &ticks,
-                    plan,
-                    &schedule.spans,
-                    (&board, exposure_s),
-                ));
+                (listener.segment)(&self.acquired(&ticks, plan, &schedule.spans, &devices));
             }
         })?;
         let over = matches!(
@@ -343,7 +353,7 @@ impl OnRig {
         if let Some(rate_hz) = foreign_rate_hz(&ticks, period_ns) {
             return Err(other_rate(rate_hz, period_ns));
         }
-        let mut acquired = self.acquired(&ticks, plan, &schedule.spans, (&board, exposure_s));
+        let mut acquired = self.acquired(&ticks, plan, &schedule.spans, &devices);
         acquired.run = run;
         let (done, of) = (acquired.records.len(), schedule.spans.len());
         acquired.trouble = if done == of {
@@ -377,7 +387,7 @@ impl OnRig {
         ticks: &[TickRecord],
         plan: &Plan,
         spans: &[Span],
-        (board, exposure_s): (&str, f64),
+        devices: &Devices,
     ) -> Acquired {
         let rows = self.rows(ticks);
         let (mut records, mut out_of_view) = (Vec::new(), Vec::new());
@@ -401,10 +411,10 @@ impl OnRig {
             late_command: rows.stalled,
             unseen: rows.unseen,
             out_of_view,
-            exposure_s,
+            exposure_s: devices.exposure_s,
             trouble: None,
             run: None,
-            board: board.to_owned(),
+            board: devices.board.clone(),
         }
     }
 
