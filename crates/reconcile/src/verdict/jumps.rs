@@ -11,6 +11,9 @@ use crate::thresholds::THRESHOLDS;
 /// Standard deviations of one chance in a thousand, both ways.
 const ONE_IN_A_THOUSAND: f64 = 3.29;
 
+/// One of at least so many rows jumps: more are a misfit or another noise.
+const MOST_OF_ROWS: usize = 100;
+
 /// A step in one row, or in two if it came during an exposure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Jump {
@@ -21,7 +24,7 @@ pub(crate) struct Jump {
 
 /// A record in which jumps were looked for.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Searched {
+pub(crate) struct RecordRows {
     pub name: String,
     pub rows: usize,
 }
@@ -29,7 +32,7 @@ pub(crate) struct Searched {
 /// The jumps of all records.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Jumps {
-    pub records: Vec<Searched>,
+    pub records: Vec<RecordRows>,
     all: Vec<Jump>,
     /// Their gain in twice the log-likelihood.
     pub gain: f64,
@@ -41,7 +44,7 @@ impl Jumps {
         let mut found = Self::default();
         let records = &ctx.problem.records;
         for (record, (r, e)) in records.iter().zip(&fit.innovations).enumerate() {
-            found.records.push(Searched {
+            found.records.push(RecordRows {
                 name: r.name.clone(),
                 rows: r.u.len(),
             });
@@ -52,6 +55,10 @@ impl Jumps {
 
     /// Takes off one after another, the largest first.
     fn find_in(&mut self, record: usize, r: &Prepared, mut e: Vec<f64>) {
+        let loud = e.iter().filter(|e| e.abs() > THRESHOLDS.jump_sd).count();
+        if loud > e.len() / MOST_OF_ROWS {
+            return;
+        }
         let first = self.all.len();
         let mut seen = vec![false; e.len()];
         loop {
@@ -65,7 +72,11 @@ impl Jumps {
             seen[row] = true;
             let of = |from: usize, until: usize| -> Vec<f64> {
                 let raw = |k: usize| f64::from(u8::from((from..until).contains(&k)));
-                r.whitened(&(0..e.len()).map(raw).collect::<Vec<f64>>())
+                let raw: Vec<f64> = (0..e.len()).map(raw).collect();
+                // A step is over in a few innovations, and the free numbers of a record are slow.
+                let mut column = vec![0.0; e.len()];
+                r.whitener.apply(&raw, &mut column);
+                column
             };
             // An exposure during which it came shows a part of it.
             let [step, edge] = [of(row, e.len()), of(row, row + 1)];
@@ -139,7 +150,7 @@ impl Jumps {
     /// Whether they are an effect: as many as a fault of the camera has, few of all rows, and no likelier while the bead is driven.
     pub(crate) fn are_an_effect(&self, ctx: &Context<'_>, fit: &Fit) -> bool {
         let rows: usize = self.records.iter().map(|r| r.rows).sum();
-        (THRESHOLDS.faults_least..rows / 100).contains(&self.count())
+        (THRESHOLDS.faults_least..rows / MOST_OF_ROWS).contains(&self.count())
             && self.driven_sd(ctx, fit).abs() < ONE_IN_A_THOUSAND
     }
 
