@@ -435,6 +435,7 @@ mod tests {
     use crate::config::LocaliserConfig;
     use crate::frame::{Frame, Pixels};
     use crate::template::ProfileSpec;
+    use cellpos_numeric::Random;
 
     const SIDE: usize = 21;
     const AT: (f64, f64) = (10.0, 10.0);
@@ -445,16 +446,10 @@ mod tests {
         let template = LocaliserConfig::new(spec).template().unwrap();
         let mut grey = vec![1000.0_f32; SIDE * SIDE];
         template.draw(&mut grey, SIDE, AT.0, AT.1, 400.0);
-        let mut state = 7 + residues.fixes * u64::from(is_new);
-        let mut uniform = || {
-            state = (state.wrapping_mul(6_364_136_223_846_793_005))
-                .wrapping_add(1_442_695_040_888_963_407);
-            (state >> 33) as f64 / (1_u64 << 31) as f64 - 0.5
-        };
-        let mut normal = || (0..12).map(|_| uniform()).sum::<f64>();
+        let mut random = Random::new(7 + residues.fixes * u64::from(is_new));
         let pixels = grey
             .iter()
-            .map(|v| (f64::from(*v) + noise * normal()).round() as u16);
+            .map(|v| (f64::from(*v) + noise * random.normal()).round() as u16);
         let pixels: Vec<u16> = pixels.collect();
         let (width, height, pixels) = (SIDE, SIDE, Pixels::Mono16(&pixels));
         let frame = Frame {

@@ -95,9 +95,12 @@ pub(crate) fn run(args: Args) -> CommandResult {
     if let Some(cells) = args.queue.cells {
         return queue::run(&args, cells);
     }
-    let mut ready = match &args.resume {
+    let ready = match &args.resume {
         Some(folder) => match resume::ready(folder, args.run.best_effort)? {
-            Next::Session(ready) => *ready,
+            Next::Session(mut ready) => {
+                args.run.choose_near(&mut ready.file);
+                *ready
+            }
             Next::Nothing(why) => {
                 print_text(&format!("{why}\n"))?;
                 return Ok(Outcome::Done);
@@ -105,7 +108,6 @@ pub(crate) fn run(args: Args) -> CommandResult {
         },
         None => fresh(&args)?,
     };
-    args.run.choose_near(&mut ready.file);
     let over = start(&args, ready, true)?;
     Ok(if over.whole {
         Outcome::Done

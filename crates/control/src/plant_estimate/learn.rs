@@ -4,7 +4,7 @@ use super::evidence::{Products, dot};
 use super::motion::{Alignment, MEMBERS};
 use super::retuning::DELAYS;
 use super::whiten::Whitener;
-use super::{AdaptState, Adapter};
+use super::{AdaptState, Adapter, age_ticks};
 use crate::estimator::Fix;
 
 /// Standard deviations from which on less is taken of a fix (Huber).
@@ -70,7 +70,7 @@ impl Adapter {
         let delay = self.delay_samples;
         state.since_fix += 1.0;
         let known = fix.and_then(|fix| {
-            let age = fix.age as f64 + fix.offset;
+            let age = age_ticks(&fix);
             let aligned = state.aligned.get_or_insert(Alignment::begin(delay, age));
             if !aligned.follow(delay, age) {
                 *aligned = Alignment::begin(delay, age);
@@ -92,7 +92,7 @@ impl Adapter {
         let correction =
             (self.whitener).correction(state.covariance, apart, fix.variance_um2, usual_um2);
         let late = DELAYS[state.force.member];
-        let shown_ago = delay + late + ago;
+        let shown_ago = self.shown_ago(state, ago);
         let cancelled_um = state.cancelled.seen(shown_ago, self.exposure_ticks);
         let cancelled_um = cancelled_um.unwrap_or(0.0);
         let series = (state.seen.as_mut())

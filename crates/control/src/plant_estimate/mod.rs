@@ -268,10 +268,14 @@ impl Adapter {
 
     /// How far the dither moved the bead at the time of a fix, or of one that would come now, um.
     pub(crate) fn dither_seen_um(&self, state: &AdaptState, fix: Option<&Fix>) -> f64 {
-        let age = fix.map_or(0.0, |fix| fix.age as f64 + fix.offset);
-        let delay = self.delay_samples + DELAYS[state.force.member] + age;
-        let seen = state.dither.motion.seen(delay, self.exposure_ticks);
+        let shown_ago = self.shown_ago(state, fix.map_or(0.0, age_ticks));
+        let seen = state.dither.motion.seen(shown_ago, self.exposure_ticks);
         state.force.log_gain.exp() * seen.unwrap_or(0.0)
+    }
+
+    /// Age of the command's motion that a fix of this age shows with the delay in force, ticks.
+    fn shown_ago(&self, state: &AdaptState, age: f64) -> f64 {
+        self.delay_samples + DELAYS[state.force.member] + age
     }
 
     /// What the frames show of the lags, as they are aligned.
@@ -396,4 +400,9 @@ fn delayed(config: EstimatorConfig, model: LoopModel, extra: f64) -> Option<Esti
 }
 
 /// The nominal delay is the design's.
+/// Time from the exposure of a fix to the tick, ticks.
+fn age_ticks(fix: &Fix) -> f64 {
+    fix.age as f64 + fix.offset
+}
+
 const _: () = assert!(DELAYS[NOMINAL] == 0.0);

@@ -1,8 +1,9 @@
 //! What is no noise in a record that shows nothing else: jumps, and lines at the mains.
 
+use crate::thresholds::THRESHOLDS;
 use std::f64::consts::TAU;
 
-/// Rows that count, without those after an increment of more than six standard deviations (by the median of their sizes). A bead
+/// Rows that count, without those after an increment of more than `jump_sd` standard deviations (by the median of their sizes). A bead
 /// that jumps is no noise: its jumps must not raise the floor that would then hide them.
 pub(super) fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
     let mut sizes: Vec<f64> = (1..e.len())
@@ -14,7 +15,7 @@ pub(super) fn without_jumps(e: &[f64], present: &[bool]) -> Vec<bool> {
     }
     let middle = sizes.len() / 2;
     let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
-    let limit = 6.0 * 1.4826 * *median;
+    let limit = THRESHOLDS.jump_sd * 1.4826 * *median;
     (0..e.len())
         .map(|k| {
             let jumps = k > 0 && limit > 0.0 && (e[k] - e[k - 1]).abs() > limit;

@@ -2,7 +2,7 @@
 
 use crate::data::frames::{FrameCounts, wilson};
 use crate::fit::context::Context;
-use crate::verdict::jumps::Jumps;
+use crate::verdict::jumps::{Jumps, rows_of_all};
 use crate::verdict::result::{Effect as NamedEffect, Interval};
 use crate::verdict::significance;
 use cellpos_plant::Effect;
@@ -93,18 +93,19 @@ impl Counted {
 
     fn add_jumps(&mut self, ctx: &Context<'_>, jumps: &Jumps, gap: f64) {
         let count = jumps.count() as f64;
-        let rows = jumps.records.iter().map(|r| r.rows as f64).sum::<f64>();
+        let rows = rows_of_all(ctx) as f64;
         let over_s = 1.0 / ctx.problem.base.sample_s;
         let [per_s, um] = [count / rows * over_s, jumps.rms_um()];
         let rate = wilson(count, rows).map(|end| end * over_s);
         let half_um = jumps.rms_error_um();
         let effect = effects::jumps(per_s, um);
+        let largest = jumps.largest();
         self.places.push(format!(
             "{}: {count} single rows; the largest is {} in {} at {:.3} s",
             effect.id(),
-            ctx.scales.told(jumps.largest().um.abs()),
-            jumps.records[jumps.largest().record].name,
-            jumps.largest().row as f64 * ctx.problem.base.sample_s,
+            ctx.scales.told(largest.um.abs()),
+            ctx.problem.records[largest.record].name,
+            largest.row as f64 * ctx.problem.base.sample_s,
         ));
         let p_value = significance::p_value(jumps.gain, jumps.count());
         let explained = jumps.gain / (jumps.gain + gap.max(0.0));

@@ -12,7 +12,7 @@ use crate::thresholds::THRESHOLDS;
 const ONE_IN_A_THOUSAND: f64 = 3.29;
 
 /// One of at least so many rows jumps: more are a misfit or another noise.
-const MOST_OF_ROWS: usize = 100;
+pub(crate) const MOST_OF_ROWS: usize = 100;
 
 /// A step in one row, or in two if it came during an exposure.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,17 +22,9 @@ pub(crate) struct Jump {
     pub um: f64,
 }
 
-/// A record in which jumps were looked for.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct RecordRows {
-    pub name: String,
-    pub rows: usize,
-}
-
 /// The jumps of all records.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Jumps {
-    pub records: Vec<RecordRows>,
     all: Vec<Jump>,
     /// Their gain in twice the log-likelihood.
     pub gain: f64,
@@ -44,10 +36,6 @@ impl Jumps {
         let mut found = Self::default();
         let records = &ctx.problem.records;
         for (record, (r, e)) in records.iter().zip(&fit.innovations).enumerate() {
-            found.records.push(RecordRows {
-                name: r.name.clone(),
-                rows: r.u.len(),
-            });
             found.find_in(record, r, e.clone());
         }
         found
@@ -149,7 +137,7 @@ impl Jumps {
 
     /// Whether they are an effect: as many as a fault of the camera has, few of all rows, and no likelier while the bead is driven.
     pub(crate) fn are_an_effect(&self, ctx: &Context<'_>, fit: &Fit) -> bool {
-        let rows: usize = self.records.iter().map(|r| r.rows).sum();
+        let rows = rows_of_all(ctx);
         (THRESHOLDS.faults_least..rows / MOST_OF_ROWS).contains(&self.count())
             && self.driven_sd(ctx, fit).abs() < ONE_IN_A_THOUSAND
     }
@@ -174,6 +162,11 @@ impl Jumps {
         let mean = self.all.iter().map(rank).sum::<f64>() / n;
         (mean - 0.5) * (12.0 * n).sqrt()
     }
+}
+
+/// Rows of all records.
+pub(crate) fn rows_of_all(ctx: &Context<'_>) -> usize {
+    ctx.problem.records.iter().map(|r| r.u.len()).sum()
 }
 
 /// What a column explains of innovations, in twice the log-likelihood.

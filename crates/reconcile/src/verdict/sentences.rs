@@ -4,6 +4,7 @@ use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;
 use crate::thresholds::THRESHOLDS;
 use crate::units::figure;
+use crate::verdict::jumps::MOST_OF_ROWS;
 use crate::verdict::map::{DiscrepancyMap, MapRow};
 
 /// Sentences about where the null model fails.
@@ -163,7 +164,8 @@ fn jumps(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
         }
     }
     let excess = fit.chi2 - fit.count as f64;
-    if jumps >= 5 && (jumps as f64) < 0.01 * fit.count as f64 && energy > 0.5 * excess {
+    let several = jumps >= THRESHOLDS.faults_least && MOST_OF_ROWS * jumps < fit.count;
+    if several && energy > 0.5 * excess {
         return Some(format!(
             "in single rows: {jumps} jumps hold {:.0} % of the excess, the largest of about {} in {} at {:.3} s",
             100.0 * (energy / excess).min(1.0),
