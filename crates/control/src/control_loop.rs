@@ -227,6 +227,9 @@ impl<L: ControlLaw> ControlLoop<L> {
         let law = &self.parts.controller;
         let stood_um = self.take_in_force(state, input);
         self.shift(state, input.zero_flow_shift_um);
+        if let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) {
+            adapter.begin(adapt, input.late_samples);
+        }
         let tick = self.estimate(state, input);
         let gain = tick.law.tuning.gain;
         let mut decided = if tick.controls {

@@ -30,7 +30,7 @@ mod test_noise;
 mod watches;
 
 use crate::arming::{Arming, ArmingConfig, ArmingState};
-use crate::grid::Grid;
+use crate::grid::{Beat, Grid};
 use crate::learners::Learners;
 use crate::life::{EventKind, Events, FreezeReason, Life, Request, SafeReason};
 use crate::reference::{ReferenceGenerator, ReferenceInput, ReferenceOutput, Stage};
@@ -53,6 +53,7 @@ struct State {
     grid: Option<Grid>,
     /// Number of the last tick on the grid.
     index: u64,
+    beat: Beat,
     counts: Counts,
     life: Life,
     safe_reason: Option<SafeReason>,
@@ -198,6 +199,7 @@ impl<R: ReferenceGenerator> Core<R> {
                 seq: 0,
                 grid: None,
                 index: 0,
+                beat: Beat::default(),
                 counts: Counts::default(),
                 life: Life::Armed,
                 safe_reason: None,
@@ -342,11 +344,14 @@ impl<R: ReferenceGenerator> Core<R> {
             let last = i64::try_from(self.state.index).unwrap_or(i64::MAX);
             u64::try_from(grid.index_after(last, input.time_ns)?).ok()?
         };
+        let (periods, late) = self.state.beat.tick(input.time_ns, period_ns);
         let mut tick = Tick {
             seq: self.state.seq,
             time_ns: input.time_ns,
             index,
             steps: (index - self.state.index).max(1),
+            periods,
+            late,
             flags: TickFlags::default(),
             events: Events::default(),
             frames_disturbed: false,
@@ -448,6 +453,7 @@ impl<R: ReferenceGenerator> Core<R> {
             preview_um: &self.preview_um,
             mode,
             slew_time_s,
+            late_samples: tick.late,
             solver: self.solver_terms(input),
             learned_um: self.learners.addition_um(
                 generated.motion,

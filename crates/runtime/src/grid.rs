@@ -61,9 +61,68 @@ impl Grid {
     }
 }
 
+/// Ticks over which a [`Beat`] follows them. It has a fifth of their jitter then, and is 16 us behind a camera that is 0.1 % off at 1 kHz.
+const FOLLOWS: i64 = 16;
+
+/// Time as model and bead see it: the periods for which the commands were in force. It follows the ticks through the grid. Where the frames
+/// leave one window for the next, two ticks are two periods apart and have numbers in a row, or one period apart and a number is left out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Beat {
+    /// Place of the last tick by the ticks before it, ns; `None` before the first.
+    place_ns: Option<i64>,
+}
+
+impl Beat {
+    /// A tick that is made at a time, ns: the periods since the last one, 1 or more, and by how much it is late, periods.
+    pub(crate) fn tick(&mut self, time_ns: i64, period_ns: i64) -> (u64, f64) {
+        let place_ns = self.place_ns.unwrap_or(time_ns.saturating_sub(period_ns));
+        let since_ns = time_ns.saturating_sub(place_ns);
+        let periods = (since_ns.saturating_add(period_ns / 2))
+            .div_euclid(period_ns)
+            .max(1);
+        let late_ns = since_ns.saturating_sub(periods.saturating_mul(period_ns));
+        self.place_ns = Some(time_ns.saturating_sub(late_ns - late_ns / FOLLOWS));
+        let late = late_ns as f64 / period_ns as f64;
+        (periods.unsigned_abs(), late.max(-1.0))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_beat_has_the_periods_that_passed_whatever_the_number_of_the_tick() {
+        const P: i64 = 1_000_000;
+        for ppm in [-1000, -15, 0, 15, 1000] {
+            let mut beat = Beat::default();
+            let (mut last, mut late) = (0, 0.0_f64);
+            for k in 0..100_000 {
+                // A frame is left out, one is late and the timer makes a tick before it, and a stall.
+                let at = match k % 1000 {
+                    300 => continue,
+                    500 => k * P + P * 3 / 10,
+                    501 => k * P - P * 7 / 20,
+                    700..705 => continue,
+                    _ => k * P,
+                };
+                let (periods, off) = beat.tick(at + k * P / 1_000_000 * ppm, P);
+                if k > 0 {
+                    assert_eq!(periods, (k - last) as u64, "{ppm} ppm, tick {k}");
+                }
+                last = k;
+                if !(500..600).contains(&(k % 1000)) {
+                    late = late.max(off.abs());
+                }
+            }
+            let most = 1e-6 * (f64::from(ppm as i32)).abs() * (FOLLOWS + 6) as f64 + 1e-3;
+            assert!(late < most, "{ppm} ppm: {late}");
+        }
+        let mut beat = Beat::default();
+        assert_eq!(beat.tick(i64::MIN, P), (1, 0.0));
+        assert!(beat.tick(i64::MAX, P).0 > 1);
+        assert_eq!(beat.tick(i64::MIN, P), (1, -1.0));
+    }
 
     #[test]
     fn a_tick_is_the_next_one_while_its_window_is_open_and_then_the_nearest() {

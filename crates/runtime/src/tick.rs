@@ -141,6 +141,9 @@ pub(crate) struct Tick {
     /// Its number on the clock's grid, and how many steps of the grid have passed since the tick before.
     pub(crate) index: u64,
     pub(crate) steps: u64,
+    /// Periods that have passed since the tick before, and by how much it is late, periods ([`crate::grid::Beat`]).
+    pub(crate) periods: u64,
+    pub(crate) late: f64,
     pub(crate) flags: TickFlags,
     pub(crate) events: Events,
     /// Whether its frame is late, missing or old.

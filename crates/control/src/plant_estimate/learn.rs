@@ -80,11 +80,12 @@ impl Adapter {
             let chosen_um = state.instrument.at(aligned, age)?;
             Some((fix, age, self.frame(aligned), at_um, chosen_um))
         });
-        let Some((fix, ago, frame, at_um, chosen_um)) = known else {
+        let Some((fix, age, frame, at_um, chosen_um)) = known else {
             state.silent = state.silent.saturating_add(1);
             return false;
         };
         state.silent = 0;
+        let ago = age - state.late;
         // From exposure to exposure, whenever the ticks were that used them.
         let apart = state.since_fix - ago;
         state.since_fix = ago;

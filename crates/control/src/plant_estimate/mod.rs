@@ -115,10 +115,15 @@ pub struct AdaptState {
     colour: Colour,
     now: learn::Now,
     lines: Lines,
-    /// The model on the path that cancels the lines, and its next command, um; `None` while the loop does not control the bead.
+    /// Time by which this tick came later than the ticks before it say, ticks. Lines go on evenly, and so does a camera; a tick does not.
+    late: f64,
+    /// The model on the path that cancels the lines, its way in this tick, and the command for that, um; `None` while the loop does not
+    /// control the bead.
     inverse: Option<FeedForwardState>,
+    way_um: f64,
     cancel_um: f64,
-    /// The model, driven with these commands, and its positions in the filter.
+    /// The last of these commands, um; the model, driven with them, and its positions in the filter.
+    cancelled_um: f64,
     cancelled: Motion,
     cancelled_seen: Track,
     force: Retuning,
@@ -199,8 +204,11 @@ impl Adapter {
             colour: Colour::new(self.whitener.noise_um2),
             now: learn::Now::default(),
             lines: Lines::new(),
+            late: 0.0,
             inverse: None,
+            way_um: 0.0,
             cancel_um: 0.0,
+            cancelled_um: 0.0,
             cancelled: Motion::start(0.0),
             cancelled_seen: Track::default(),
             force: Retuning::default(),
@@ -268,7 +276,7 @@ impl Adapter {
 
     /// How far the dither moved the bead at the time of a fix, or of one that would come now, um.
     pub(crate) fn dither_seen_um(&self, state: &AdaptState, fix: Option<&Fix>) -> f64 {
-        let shown_ago = self.shown_ago(state, fix.map_or(0.0, age_ticks));
+        let shown_ago = self.shown_ago(state, fix.map_or(0.0, age_ticks) - state.late);
         let seen = state.dither.motion.seen(shown_ago, self.exposure_ticks);
         state.force.log_gain.exp() * seen.unwrap_or(0.0)
     }
@@ -309,9 +317,9 @@ impl Adapter {
         let learned = self.learn(state, tick.fix.filter(|_| learns));
         let rest_um = tick.command_um - tick.cancel_um;
         let finite = self.drive(state, rest_um, tick.chosen_um)
-            && state.cancelled.drive(&self.nominal, tick.cancel_um);
+            && self.drive_cancelled(state, tick.cancel_um);
         state.lines.tick(&self.lines);
-        self.cancel_lines(state, tick.free);
+        self.hold_against_lines(state, tick.free);
         if !learns {
             state.force.wait();
         }
@@ -337,30 +345,51 @@ impl Adapter {
         state.news = None;
         self.learn(state, None);
         // The command that cancels the lines should have changed; the difference moves the bead.
+        self.begin(state, state.late);
         let rest_um = command_um - state.cancel_um;
         let finite = state.model.drive(&self.nominal, rest_um)
             && (state.instrument).drive(&self.nominal, state.dither.given_um)
             && state.dither.hold(&self.nominal)
-            && state.cancelled.drive(&self.nominal, state.cancel_um);
+            && self.drive_cancelled(state, state.cancel_um);
         state.lines.tick(&self.lines);
-        self.cancel_lines(state, state.inverse.is_some());
         if !finite {
             *state = self.start(command_um);
         }
     }
 
-    /// The command of the next tick: it moves the model opposite to the lines. What a new estimate of them corrects moves nothing: the law
-    /// has brought the bead to its reference, wherever it stands on its way.
-    fn cancel_lines(&self, state: &mut AdaptState, free: bool) {
+    /// At the start of a tick that is `late` by so many ticks: the command that moves the model opposite to the lines until one tick later.
+    ///
+    /// The last command was to have done so until one tick after the last tick. If this one is not then, it was in force for longer or
+    /// less long. What a new estimate of the lines corrects moves nothing: the law has brought the bead to its reference, wherever it
+    /// stands on its way.
+    pub(crate) fn begin(&self, state: &mut AdaptState, late: f64) {
+        let late = if late.is_finite() { late } else { 0.0 };
+        let later = late - state.late;
         state.cancel_um = 0.0;
-        if !free {
-            state.inverse = None;
-            return;
+        if let Some(model) = &mut state.inverse {
+            let lines = &state.lines;
+            state.way_um = lines.at_um(state.late) - lines.at_um(late + 1.0) - later * state.way_um;
+            let next_um = self.forward.position(model) + state.way_um;
+            state.cancel_um = self.forward.step(model, next_um);
         }
-        let way_um = state.lines.at_um(1.0) - state.lines.at_um(0.0);
-        let model = state.inverse.get_or_insert(FeedForward::rest(0.0));
-        let next_um = self.forward.position(model) - way_um;
-        state.cancel_um = self.forward.step(model, next_um);
+        state.late = late;
+    }
+
+    /// The model one even tick on with what cancels the lines. The command before it was in force for longer by as much as this tick is late,
+    /// so their mean moves the bead as far. Whether all is finite.
+    fn drive_cancelled(&self, state: &mut AdaptState, command_um: f64) -> bool {
+        let mean_um = command_um - state.late * (command_um - state.cancelled_um);
+        state.cancelled_um = command_um;
+        state.cancelled.drive(&self.nominal, mean_um)
+    }
+
+    /// Whether the lines are cancelled from the next tick on: while the loop controls the bead.
+    fn hold_against_lines(&self, state: &mut AdaptState, free: bool) {
+        if free {
+            state.inverse.get_or_insert(FeedForward::rest(0.0));
+        } else {
+            (state.inverse, state.way_um) = (None, 0.0);
+        }
     }
 
     /// The models one tick on. Whether all is finite.
@@ -399,10 +428,10 @@ fn delayed(config: EstimatorConfig, model: LoopModel, extra: f64) -> Option<Esti
     Estimator::new(config, LoopModel { delay_s, ..model }).ok()
 }
 
-/// The nominal delay is the design's.
 /// Time from the exposure of a fix to the tick, ticks.
 fn age_ticks(fix: &Fix) -> f64 {
     fix.age as f64 + fix.offset
 }
 
+// The nominal delay is the design's.
 const _: () = assert!(DELAYS[NOMINAL] == 0.0);

@@ -13,10 +13,17 @@ use cellpos_rig::{ActuatorReport, ActuatorState};
 use cellpos_vision::Decision;
 
 impl<R: ReferenceGenerator> Core<R> {
-    /// Accounts for ticks that never came: the last command was held, the bead moved on, and so did the plan.
+    /// Accounts for ticks that never came: the last command was held, the bead moved on, and so did the plan. The bead moves by the time that
+    /// passed, the plan by the numbers of the ticks.
     pub(super) fn catch_up(&mut self, tick: &mut Tick) {
         /// A loop that stood still for longer has lost sight of the bead; its board's watchdog has parked the PZT.
         const LONGEST_NS: i64 = 1_000_000_000;
+        let most = (LONGEST_NS / self.timing.period_ns()).max(1).unsigned_abs();
+        for _ in 1..tick.periods.min(most.saturating_add(1)) {
+            self.controller.skip();
+            let held_um = self.controller.previous_command_um();
+            self.state.following.skip(held_um);
+        }
         let skipped = tick.steps - 1;
         if skipped == 0 {
             return;
@@ -24,7 +31,6 @@ impl<R: ReferenceGenerator> Core<R> {
         tick.commands_disturbed = true;
         tick.event(EventKind::TicksSkipped { count: skipped });
         self.state.counts.skipped += skipped;
-        let most = (LONGEST_NS / self.timing.period_ns()).max(1).unsigned_abs();
         let stalled_ns = skipped.min(most).cast_signed() * self.timing.period_ns();
         self.state.caught_up_ns =
             tick.time_ns + stalled_ns + Timing::ms_to_ns(self.timing.oldest_ms);
@@ -33,10 +39,6 @@ impl<R: ReferenceGenerator> Core<R> {
         }
         let running = self.state.life == Life::Running;
         for index in tick.index.saturating_sub(skipped.min(most))..tick.index {
-            self.controller.skip();
-            self.state
-                .following
-                .skip(self.controller.previous_command_um());
             let told = ReferenceInput {
                 running,
                 frozen: self.state.frozen.any(),
