@@ -110,10 +110,12 @@ impl LineSettings {
 }
 
 impl Line {
-    /// Its motion of the bead some ticks from now, um.
-    fn at_um(&self, ticks: f64) -> f64 {
+    /// Where a motion against it is to be at a tick some ticks from now, um. The command is held, so the motion is straight from tick to tick.
+    /// Its part at the line's frequency is less than its ends by the square of a sinc; so these are as much beyond the line.
+    fn end_um(&self, ticks: f64) -> f64 {
         let phase = product(self.phase, unit(self.turn * ticks));
-        product(self.amplitude, phase)[0]
+        let half = 0.5 * self.turn;
+        product(self.amplitude, phase)[0] * (half / half.sin()).powi(2)
     }
 }
 
@@ -136,10 +138,10 @@ impl Lines {
         &self.lines[..self.count]
     }
 
-    /// Motion of the bead by the confirmed lines `ticks` ticks from now, um.
-    pub(super) fn at_um(&self, ticks: f64) -> f64 {
+    /// Where a motion against the confirmed lines is to be at a tick `ticks` ticks from now, um.
+    pub(super) fn end_um(&self, ticks: f64) -> f64 {
         let confirmed = self.now().iter().filter(|line| line.confirmed);
-        confirmed.map(|line| line.at_um(ticks)).sum()
+        confirmed.map(|line| line.end_um(ticks)).sum()
     }
 
     /// A tick on; a part of the search.

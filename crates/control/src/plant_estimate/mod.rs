@@ -368,7 +368,8 @@ impl Adapter {
         state.cancel_um = 0.0;
         if let Some(model) = &mut state.inverse {
             let lines = &state.lines;
-            state.way_um = lines.at_um(state.late) - lines.at_um(late + 1.0) - later * state.way_um;
+            state.way_um =
+                lines.end_um(state.late) - lines.end_um(late + 1.0) - later * state.way_um;
             let next_um = self.forward.position(model) + state.way_um;
             state.cancel_um = self.forward.step(model, next_um);
         }

@@ -8,15 +8,15 @@ use std::collections::VecDeque;
 use std::f64::consts::{LN_2, TAU};
 
 /// Steps of the world in a millisecond.
-const FINE: usize = 20;
-const STEP_S: f64 = 1e-3 / FINE as f64;
-const NEUTRAL_UM: f64 = 20.0;
-const DELAY_MS: usize = 2;
-const EXPOSURE_STEPS: usize = 4;
+pub(crate) const FINE: usize = 20;
+pub(crate) const STEP_S: f64 = 1e-3 / FINE as f64;
+pub(crate) const NEUTRAL_UM: f64 = 20.0;
+pub(crate) const DELAY_MS: usize = 2;
+pub(crate) const EXPOSURE_STEPS: usize = 4;
 const NOISE_UM: f64 = 0.02;
 
 /// Eq. (6) in controllable form, by Heun's method, and what else moves the bead.
-struct World {
+pub(crate) struct World {
     random: Random,
     x: [f64; 2],
     walk_um: f64,
@@ -25,14 +25,16 @@ struct World {
     gain: f64,
     late_steps: usize,
     flow: Flow,
+    /// Where another flow has moved the bead, um.
+    pub(crate) moved_um: f64,
     time_s: f64,
     /// Mean position in each step, newest first: the PZT's jump at the start of a tick is no part of the step before.
-    path_um: VecDeque<f64>,
+    pub(crate) path_um: VecDeque<f64>,
 }
 
 /// A disturbance beyond diffusion.
 #[derive(Debug, Clone, Copy)]
-enum Flow {
+pub(crate) enum Flow {
     None,
     /// Frequency, Hz, and amplitude, um, of the fundamental; harmonic `n` has the `n`th part of it.
     Lines(f64, f64, u8),
@@ -41,7 +43,7 @@ enum Flow {
 }
 
 impl World {
-    fn new(seed: u64, flow: Flow) -> Self {
+    pub(crate) fn new(seed: u64, flow: Flow) -> Self {
         Self {
             random: Random::new(seed),
             x: [0.0; 2],
@@ -50,12 +52,13 @@ impl World {
             gain: 1.0,
             late_steps: 0,
             flow,
+            moved_um: 0.0,
             time_s: 0.0,
             path_um: VecDeque::from(vec![0.0; 12 * FINE]),
         }
     }
 
-    fn advance(&mut self, command_um: f64) {
+    pub(crate) fn advance(&mut self, command_um: f64) {
         let u = self.gain * (command_um - NEUTRAL_UM);
         let (k, b1, b0, a1, a0) = (0.01872, 20_261.5, 1_745_041.0, 76.3, 0.13);
         let pzt_um = |x: [f64; 2]| k * ((b0 - a0) * x[0] + (b1 - a1) * x[1] + u);
@@ -81,12 +84,13 @@ impl World {
             }
         };
         let mean_um = 0.5 * (start_um + pzt_um(self.x));
-        self.path_um.push_front(mean_um + self.walk_um + line_um);
+        self.path_um
+            .push_front(mean_um + self.walk_um + line_um + self.moved_um);
         self.path_um.truncate(12 * FINE);
     }
 
     /// The fix that arrives now: the mean over an exposure whose middle is the delay old, and some steps more.
-    fn fix(&mut self, older_steps: i32, rate: usize) -> Measurement {
+    pub(crate) fn fix(&mut self, older_steps: i32, rate: usize) -> Measurement {
         let ago = DELAY_MS * FINE + self.late_steps - EXPOSURE_STEPS / 2;
         let from = ago.checked_add_signed(older_steps as isize).unwrap();
         let sum_um: f64 = (from..from + EXPOSURE_STEPS).map(|k| self.path_um[k]).sum();
@@ -485,6 +489,9 @@ fn held_nm(line_um: f64, ticks: Ticks, seed: u64) -> f64 {
         while at < to {
             world.advance(controller.previous_command_um());
             at += 1;
+            if k > 10_000 {
+                squares.push((1e3 * world.path_um[0]).powi(2));
+            }
         }
         let since = (to as f64 - place) / FINE as f64;
         let periods = since.round().max(1.0);
@@ -503,9 +510,6 @@ fn held_nm(line_um: f64, ticks: Ticks, seed: u64) -> f64 {
             ..LoopInput::default()
         };
         controller.step(&input);
-        if k > 10_000 {
-            squares.push((1e3 * world.path_um[0]).powi(2));
-        }
     }
     (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
 }
