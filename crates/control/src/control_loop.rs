@@ -214,11 +214,7 @@ impl<L: ControlLaw> ControlLoop<L> {
                 assumed
             },
             age: usize::from(age_samples),
-            offset: if offset_samples.abs() <= 0.5 {
-                offset_samples
-            } else {
-                0.0
-            },
+            offset: (Some(offset_samples).filter(|part| part.abs() <= 0.5)).unwrap_or(0.0),
         })
     }
 
@@ -227,9 +223,6 @@ impl<L: ControlLaw> ControlLoop<L> {
         let law = &self.parts.controller;
         let stood_um = self.take_in_force(state, input);
         self.shift(state, input.zero_flow_shift_um);
-        if let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) {
-            adapter.begin(adapt, input.late_samples);
-        }
         let tick = self.estimate(state, input);
         let gain = tick.law.tuning.gain;
         let mut decided = if tick.controls {
@@ -368,7 +361,12 @@ impl<L: ControlLaw> ControlLoop<L> {
         let tuning = self.tuning(state);
         let estimator = self.estimator_of(state);
         let before_um = state.estimator.neutral_um;
-        let mut estimate: Estimate = estimator.step(&mut state.estimator, fix);
+        let mut seen = fix;
+        if let (Some(adapter), Some(adapt)) = (&self.adapter, &mut state.adapt) {
+            adapter.begin(adapt, input.late_samples);
+            seen = fix.map(|fix| adapter.without_lines(adapt, fix));
+        }
+        let mut estimate: Estimate = estimator.step(&mut state.estimator, seen);
         let Limits {
             low_um, high_um, ..
         } = self.parts.limits;
@@ -394,8 +392,8 @@ impl<L: ControlLaw> ControlLoop<L> {
             dithered_um = adapter.dither_seen_um(adapt, at);
         }
         // What a PI controller sees: the fix itself where there is one, else what the model says it would be.
-        let bead_um = match fix {
-            Some(fix) if estimate.fresh => fix.position_um,
+        let bead_um = match seen {
+            Some(seen) if estimate.fresh => seen.position_um,
             _ => estimate.predicted_measurement_um,
         } - dithered_um;
         let reference_ok = input.reference_um.abs() < FAR_UM;

@@ -41,6 +41,8 @@ pub(super) struct LineSettings {
     sample_s: f64,
     /// Ticks from fix to fix.
     interval: f64,
+    /// Time in which the speed moves the bead as far as the plant's jump does, ticks.
+    jump: f64,
     search: SearchSettings,
     /// Square of the amplitude of a candidate over its variance that chance exceeds in one of `FALSE_S / CANDIDATE_S`.
     sure: f64,
@@ -81,11 +83,13 @@ fn product(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
 }
 
 impl LineSettings {
-    /// For a loop of this sample time, s, and `interval` ticks from fix to fix.
-    pub(super) fn new(sample_s: f64, interval: f64) -> Self {
+    /// For a loop of this sample time, s, and `interval` ticks from fix to fix. With each command the bead jumps as far as its speed then
+    /// moves it in `jump` ticks.
+    pub(super) fn new(sample_s: f64, interval: f64, jump: f64) -> Self {
         Self {
             sample_s,
             interval,
+            jump,
             search: SearchSettings::new(sample_s, interval),
             // The sum of two squares of a normal distribution.
             sure: 2.0 * (FALSE_S / CANDIDATE_S).ln(),
@@ -110,12 +114,36 @@ impl LineSettings {
 }
 
 impl Line {
-    /// Where a motion against it is to be at a tick some ticks from now, um. The command is held, so the motion is straight from tick to tick.
-    /// Its part at the line's frequency is less than its ends by the square of a sinc; so these are as much beyond the line.
-    fn end_um(&self, ticks: f64) -> f64 {
-        let phase = product(self.phase, unit(self.turn * ticks));
-        let half = 0.5 * self.turn;
-        product(self.amplitude, phase)[0] * (half / half.sin()).powi(2)
+    /// It some ticks from now, um.
+    fn at(&self, ticks: f64) -> [f64; 2] {
+        product(self.amplitude, product(self.phase, unit(self.turn * ticks)))
+    }
+
+    /// Where a motion against it is to be at a tick some ticks from now, um.
+    ///
+    /// The command is held, so the motion jumps at a tick and is straight until the next one. Of a motion whose ends turn by `w` in a tick,
+    /// this part is left at the line's frequency, and the ends are as much beyond the line:
+    /// `sinc(w/2)^2 - jump (2 - 2 cos w) int_0^1 (1 - x) exp(-i w x) dx`.
+    fn end(&self, ticks: f64, jump: f64) -> [f64; 2] {
+        let w = self.turn;
+        let (sin, cos) = w.sin_cos();
+        let straight = (2.0 - 2.0 * cos) / (w * w);
+        let jumps = jump * (2.0 - 2.0 * cos);
+        let part = [
+            straight - 0.5 * jumps * straight,
+            jumps * (1.0 - sin / w) / w,
+        ];
+        let at = product(self.at(ticks), [part[0], -part[1]]);
+        at.map(|um| um / square(part))
+    }
+
+    /// What the motion against it leaves of it between two ticks, some ticks ago, um.
+    fn left_um(&self, ago: f64, jump: f64) -> f64 {
+        let newer = ago.floor();
+        let (since, [cos, sin]) = (1.0 - (ago - newer), unit(self.turn));
+        let jumped = 1.0 + jump * (2.0 * cos - 2.0);
+        let way = [(1.0 - since) * jumped + since * cos, since * sin];
+        self.at(-ago)[0] - product(self.end(-newer - 1.0, jump), way)[0]
     }
 }
 
@@ -139,9 +167,17 @@ impl Lines {
     }
 
     /// Where a motion against the confirmed lines is to be at a tick `ticks` ticks from now, um.
-    pub(super) fn end_um(&self, ticks: f64) -> f64 {
+    pub(super) fn end_um(&self, settings: &LineSettings, ticks: f64) -> f64 {
         let confirmed = self.now().iter().filter(|line| line.confirmed);
-        confirmed.map(|line| line.end_um(ticks)).sum()
+        confirmed
+            .map(|line| line.end(ticks, settings.jump)[0])
+            .sum()
+    }
+
+    /// What the motion against the confirmed lines leaves of them some ticks ago, um: it is that of a held command.
+    pub(super) fn left_um(&self, settings: &LineSettings, ago: f64) -> f64 {
+        let confirmed = self.now().iter().filter(|line| line.confirmed);
+        confirmed.map(|line| line.left_um(ago, settings.jump)).sum()
     }
 
     /// A tick on; a part of the search.

@@ -23,6 +23,7 @@ mod whiten;
 use crate::design::bound_rms_um;
 use crate::error::BuildError;
 use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
+use crate::exposure::mean;
 use crate::feedforward::{FeedForward, FeedForwardState};
 use crate::loop_model::LoopModel;
 use crate::tuning::Tuning;
@@ -170,6 +171,7 @@ impl Adapter {
         let hold_um = bound_rms_um(config.diffusion_um2_per_s, 0.0, model.delay_s, ts);
         // Where a lag keeps the plant from moving at once it still gets there, and where it moves at once it may not stay.
         let moves = model.gain_per_s.abs().max(model.fast_gain_per_s().abs()) * ts;
+        let jump = model.feedthrough * model.gain_per_s.signum() / moves;
         Ok(Self {
             // Independent of the rest of the error, so that the squares add.
             side_um: (0.02 * config.dither_percent).sqrt() * hold_um / moves,
@@ -178,10 +180,10 @@ impl Adapter {
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
-            lines: LineSettings::new(ts, config.ticks_per_fix),
+            lines: LineSettings::new(ts, config.ticks_per_fix, jump),
             forward: FeedForward::new(&model)?,
             delay_samples: model.delay_samples(),
-            jump: model.feedthrough * model.gain_per_s.signum() / moves,
+            jump,
             sample_s: ts,
             interval: config.ticks_per_fix,
             planned_gap: config.planned_gap(),
@@ -281,6 +283,20 @@ impl Adapter {
         state.force.log_gain.exp() * seen.unwrap_or(0.0)
     }
 
+    /// A fix without what the lines do between the ticks, where a held command does not cancel them: no law can.
+    pub(crate) fn without_lines(&self, state: &AdaptState, fix: Fix) -> Fix {
+        if state.inverse.is_none() {
+            return fix;
+        }
+        let shown_ago = self.shown_ago(state, age_ticks(&fix) - state.late);
+        let left = |ago| Some(state.lines.left_um(&self.lines, ago));
+        let left_um = mean(shown_ago, self.exposure_ticks, left).unwrap_or(0.0);
+        Fix {
+            position_um: fix.position_um - state.force.log_gain.exp() * left_um,
+            ..fix
+        }
+    }
+
     /// Age of the command's motion that a fix of this age shows with the delay in force, ticks.
     fn shown_ago(&self, state: &AdaptState, age: f64) -> f64 {
         self.delay_samples + DELAYS[state.force.member] + age
@@ -368,8 +384,9 @@ impl Adapter {
         state.cancel_um = 0.0;
         if let Some(model) = &mut state.inverse {
             let lines = &state.lines;
-            state.way_um =
-                lines.end_um(state.late) - lines.end_um(late + 1.0) - later * state.way_um;
+            state.way_um = lines.end_um(&self.lines, state.late)
+                - lines.end_um(&self.lines, late + 1.0)
+                - later * state.way_um;
             let next_um = self.forward.position(model) + state.way_um;
             state.cancel_um = self.forward.step(model, next_um);
         }

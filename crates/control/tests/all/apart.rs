@@ -93,12 +93,14 @@ impl World {
     pub(crate) fn fix(&mut self, older_steps: i32, rate: usize) -> Measurement {
         let ago = DELAY_MS * FINE + self.late_steps - EXPOSURE_STEPS / 2;
         let from = ago.checked_add_signed(older_steps as isize).unwrap();
+        let older = f64::from(older_steps) * (rate as f64 / FINE as f64);
+        let age = older.round();
         let sum_um: f64 = (from..from + EXPOSURE_STEPS).map(|k| self.path_um[k]).sum();
         Measurement {
             position_um: sum_um / EXPOSURE_STEPS as f64 + NOISE_UM * self.random.normal(),
             variance_um2: NOISE_UM * NOISE_UM,
-            age_samples: 0,
-            offset_samples: f64::from(older_steps) * (rate as f64 / FINE as f64),
+            age_samples: age.max(0.0) as u16,
+            offset_samples: older - age.max(0.0),
         }
     }
 }
