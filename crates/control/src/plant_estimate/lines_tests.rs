@@ -18,7 +18,7 @@ struct White {
 impl White {
     fn new(seed: u64, sample_s: f64, interval: f64) -> Self {
         Self {
-            settings: LineSettings::new(sample_s, interval),
+            settings: LineSettings::new(sample_s, interval, 0.0),
             whitener: Whitener::new(6.6e-4, 1e-9, 4e-4, interval).unwrap(),
             lines: Lines::new(),
             random: Random::new(seed),
