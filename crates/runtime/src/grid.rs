@@ -75,7 +75,10 @@ pub(crate) struct Beat {
 impl Beat {
     /// A tick that is made at a time, ns: the periods since the last one, 1 or more, and by how much it is late, periods.
     pub(crate) fn tick(&mut self, time_ns: i64, period_ns: i64) -> (u64, f64) {
-        let place_ns = self.place_ns.unwrap_or(time_ns.saturating_sub(period_ns));
+        let Some(place_ns) = self.place_ns else {
+            self.place_ns = Some(time_ns);
+            return (1, 0.0);
+        };
         let since_ns = time_ns.saturating_sub(place_ns);
         let periods = (since_ns.saturating_add(period_ns / 2))
             .div_euclid(period_ns)
