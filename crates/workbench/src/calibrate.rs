@@ -10,10 +10,12 @@ use crate::mover::Mover;
 use crate::rig_text::change;
 use crate::watch::{Sighting, Watch};
 use cellpos_drivers::{Axis, CalibrationFile};
+use cellpos_plant::{Hertz, TransferFunction};
 use cellpos_rig::Clock;
 use cellpos_runtime::realtime;
 use cellpos_session::Failure;
 use serde::Serialize;
+use std::f64::consts::TAU;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
@@ -38,6 +40,24 @@ impl Default for Pulses {
             length_ms: 15,
             pairs: 40,
         }
+    }
+}
+
+impl Pulses {
+    /// Velocity per displacement that these pulses show of a plant, 1/s. The regression of a velocity on a square wave weighs the real parts
+    /// of the response at its odd harmonics by their power.
+    pub fn velocity_gain_per_s(&self, plant: &TransferFunction) -> f64 {
+        const HARMONICS: u32 = 32;
+        let first_hz = 1e3 / (2.0 * f64::from(self.length_ms));
+        let odd = (0..HARMONICS).map(|k| f64::from(2 * k + 1));
+        let (mut gain, mut power) = (0.0, 0.0);
+        for n in odd {
+            let hz = n * first_hz;
+            // j w G(j w), its real part.
+            gain -= TAU * hz * plant.response(Hertz(hz)).im / (n * n);
+            power += 1.0 / (n * n);
+        }
+        gain / power
     }
 }
 
@@ -279,8 +299,9 @@ fn fit(commands: &[(i64, f64)], sightings: &[Sighting], size_px: [usize; 2]) -> 
     if pairs.len() < 50 {
         return None;
     }
-    (0..=12)
-        .map(|half_ms| regress(commands, &pairs, half_ms * 500_000, size_px))
+    // A lag that is 0.25 ms off takes 3 % of the slope of pulses of 15 ms.
+    (-10..=60)
+        .map(|tenth_ms| regress(commands, &pairs, tenth_ms * 100_000, size_px))
         .min_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, response)| response)
 }
@@ -364,12 +385,13 @@ mod tests {
             })
             .collect();
         let (mut x, mut y) = (100.0, 30.0);
+        let lag_ns = 2_200_000;
         let sightings: Vec<Sighting> = (10..500)
             .map(|k| {
                 let u = mean_offset(
                     &commands,
-                    (k - 1) * 1_000_000 - 2_000_000,
-                    k * 1_000_000 - 2_000_000,
+                    (k - 1) * 1_000_000 - lag_ns,
+                    k * 1_000_000 - lag_ns,
                 );
                 x += (gx * u + 300.0) * 1e-3;
                 y += gy * u * 1e-3;
@@ -384,10 +406,39 @@ mod tests {
         let (axis, sign, tilt_deg, _) = response.direction();
         assert_eq!((axis, sign), (Axis::X, -1));
         assert!((tilt_deg + 10.0).abs() < 0.5, "{tilt_deg}");
-        assert!((response.gain() - 4000.0).abs() < 40.0, "{response:?}");
-        assert!((response.lag_ms - 2.0).abs() < 1e-9, "{response:?}");
+        assert!((response.gain() - 4000.0).abs() < 20.0, "{response:?}");
+        assert!((response.lag_ms - 2.2).abs() < 1e-9, "{response:?}");
         let file = response.calibration(0.1, 0.001, "test".to_string());
         assert_eq!((file.axis, file.sign, file.origin_px), (Axis::X, -1, 127.5));
+    }
+
+    #[test]
+    fn the_gain_of_a_plant_is_that_which_its_pulses_show() {
+        // The paper's plant, integrated in steps of 0.1 ms, frames each ms.
+        let plant = TransferFunction::eq6();
+        let pulses = Pulses::default();
+        let (k, b1, b0, a1, a0) = (0.01872, 20_261.5, 1_745_041.0, 76.3, 0.13);
+        let mut state = [0.0_f64; 2];
+        let (mut commands, mut sightings) = (Vec::new(), Vec::new());
+        for ms in 0..2 * pulses.length_ms * pulses.pairs {
+            let is_up = ((ms + pulses.length_ms / 2) / pulses.length_ms).is_multiple_of(2);
+            let u = if is_up { 0.2 } else { -0.2 };
+            let at_ns = i64::from(ms) * 1_000_000;
+            commands.push((at_ns, u));
+            let um = k * ((b0 - a0) * state[0] + (b1 - a1) * state[1] + u);
+            sightings.push(Sighting {
+                at_ns,
+                x_px: 10.0 * um,
+                y_px: 0.0,
+            });
+            for _ in 0..10 {
+                let slope = [state[1], u - a1 * state[1] - a0 * state[0]];
+                state = [0, 1].map(|i| state[i] + 1e-4 * slope[i]);
+            }
+        }
+        let shown = fit(&commands, &sightings, [256, 64]).expect("enough frames");
+        let ratio = shown.gain() / 10.0 / pulses.velocity_gain_per_s(&plant);
+        assert!((ratio - 1.0).abs() < 0.01, "{ratio} {shown:?}");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::outcome::{CommandResult, Failure, Outcome, print_json, print_text};
 use crate::rig_file::RigFile;
 use cellpos_drivers::CalibrationFile;
 use cellpos_numeric::units::Micrometers;
-use cellpos_plant::{Hertz, Model};
+use cellpos_plant::Model;
 use cellpos_workbench::Bench;
 use cellpos_workbench::calibrate::{self, Pulses, Response};
 use cellpos_workbench::snapshot;
@@ -110,8 +110,7 @@ pub(crate) fn run(args: Args) -> CommandResult {
         pixel_um_sd,
         format!("{source}; axis and sign by PZT pulses"),
     );
-    // Start of the pulses.
-    let gain_per_s = model.plant.velocity_gain_at(Hertz(20.0)).abs();
+    let gain_per_s = pulses.velocity_gain_per_s(&model.plant).abs();
     let pixel_of_model_um = gain_per_s / response.gain();
     let gain_ratio = pixel_um / pixel_of_model_um;
     let mut warnings = Vec::new();
