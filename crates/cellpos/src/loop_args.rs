@@ -69,6 +69,13 @@ impl LoopArgs {
     pub(crate) fn prepare(&self, file: &RigFile) -> Result<Prepared, Failure> {
         let mut prepared = connect::prepare(&self.model, &self.controller, file)?;
         adapt::choose(self.adapt, &mut prepared.controller);
+        let estimator = &prepared.controller.estimator;
+        if estimator.adapt && !estimator.adapts() {
+            tracing::warn!(
+                "the loop does not adapt: dither_percent = 0 in {}",
+                self.controller
+            );
+        }
         Ok(prepared)
     }
 

@@ -77,8 +77,7 @@ impl<L: ControlLaw> ControlLoop<L> {
     pub fn new(parts: LoopParts<L>) -> Result<Self, BuildError> {
         parts.limits.validate()?;
         let (config, model) = (parts.estimator, parts.model);
-        let adapter = config
-            .adapt
+        let adapter = (config.adapts())
             .then(|| Adapter::new(config, model))
             .transpose()?;
         Ok(Self {

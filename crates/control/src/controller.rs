@@ -160,7 +160,7 @@ impl Controller {
         let law = &parts.controller;
         let own = law.columns();
         let mut columns = own.to_vec();
-        if parts.estimator.adapt {
+        if parts.estimator.adapts() {
             columns.extend(ADAPT_COLUMNS);
         }
         check_columns(&columns)?;

@@ -49,7 +49,8 @@ pub struct EstimatorConfig {
     /// Gain and delay of the plant are estimated while the loop runs, and the law follows them.
     #[serde(skip_serializing_if = "is_off")]
     pub adapt: bool,
-    /// Largest addition of the dither of adaptation to the hold error, %: the gain is known by it, with a standard deviation that falls with the root.
+    /// Largest addition of the dither of adaptation to the hold error, %: the gain is known by it, with a standard deviation that falls with
+    /// the root. With 0 the loop does not adapt.
     #[serde(skip_serializing_if = "is_usual_dither")]
     pub dither_percent: f64,
 }
@@ -102,6 +103,11 @@ impl EstimatorConfig {
     /// one more, since fixes come a tick late now and then.
     pub fn planned_gap(&self) -> u32 {
         planned_gap(self.ticks_per_fix)
+    }
+
+    /// Whether gain and delay are estimated: nothing tells them without dither.
+    pub fn adapts(&self) -> bool {
+        self.adapt && self.dither_percent > 0.0
     }
 
     /// Checks every value.
@@ -168,8 +174,8 @@ impl EstimatorConfig {
             "dither_percent",
             "%",
             c.dither_percent,
-            (0.1..=10.0).contains(&c.dither_percent),
-            "0.1 to 10; adapt = false runs without dither and without adaptation",
+            c.dither_percent == 0.0 || (0.1..=10.0).contains(&c.dither_percent),
+            "0.1 to 10, or 0 for a loop that does not adapt",
         )?;
         check(
             "gate_sigma",
