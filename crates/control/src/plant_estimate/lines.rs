@@ -82,6 +82,10 @@ fn product(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
     [a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]]
 }
 
+fn quotient(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
+    product(a, [b[0], -b[1]]).map(|part| part / square(b).max(f64::MIN_POSITIVE))
+}
+
 impl LineSettings {
     /// For a loop of this sample time, s, and `interval` ticks from fix to fix. With each command the bead jumps as far as its speed then
     /// moves it in `jump` ticks.
@@ -119,30 +123,35 @@ impl Line {
         product(self.amplitude, product(self.phase, unit(self.turn * ticks)))
     }
 
+    /// Jump at a tick of a motion against it, over where that motion ends the tick before: `D (u_k - u_(k-1))` where a command moves the bead
+    /// by `m u_k + D (u_k - u_(k-1))` in a tick, and `jump` is `D/m`.
+    fn jump(&self, jump: f64) -> [f64; 2] {
+        let [cos, sin] = unit(self.turn);
+        let over = [1.0 + jump * (1.0 - cos), jump * sin];
+        quotient([jump * (2.0 * cos - 2.0), 0.0], over)
+    }
+
     /// Where a motion against it is to be at a tick some ticks from now, um.
     ///
     /// The command is held, so the motion jumps at a tick and is straight until the next one. Of a motion whose ends turn by `w` in a tick,
     /// this part is left at the line's frequency, and the ends are as much beyond the line:
-    /// `sinc(w/2)^2 - jump (2 - 2 cos w) int_0^1 (1 - x) exp(-i w x) dx`.
+    /// `sinc(w/2)^2 + jump int_0^1 (1 - x) exp(-i w x) dx`.
     fn end(&self, ticks: f64, jump: f64) -> [f64; 2] {
-        let w = self.turn;
-        let (sin, cos) = w.sin_cos();
+        let (w, [cos, sin]) = (self.turn, unit(self.turn));
         let straight = (2.0 - 2.0 * cos) / (w * w);
-        let jumps = jump * (2.0 - 2.0 * cos);
-        let part = [
-            straight - 0.5 * jumps * straight,
-            jumps * (1.0 - sin / w) / w,
-        ];
-        let at = product(self.at(ticks), [part[0], -part[1]]);
-        at.map(|um| um / square(part))
+        let jumps = product(self.jump(jump), [0.5 * straight, (sin / w - 1.0) / w]);
+        quotient(self.at(ticks), [straight + jumps[0], jumps[1]])
     }
 
     /// What the motion against it leaves of it between two ticks, some ticks ago, um.
     fn left_um(&self, ago: f64, jump: f64) -> f64 {
         let newer = ago.floor();
         let (since, [cos, sin]) = (1.0 - (ago - newer), unit(self.turn));
-        let jumped = 1.0 + jump * (2.0 * cos - 2.0);
-        let way = [(1.0 - since) * jumped + since * cos, since * sin];
+        let jumped = self.jump(jump).map(|part| (1.0 - since) * part);
+        let way = [
+            1.0 - since + jumped[0] + since * cos,
+            jumped[1] + since * sin,
+        ];
         self.at(-ago)[0] - product(self.end(-newer - 1.0, jump), way)[0]
     }
 }

@@ -77,3 +77,46 @@ fn lines_are_found_in_white_noise_as_often_as_is_said() {
     // 2.9 are expected, and chance makes more than 7 once in 100.
     assert!(found <= 7, "{found}");
 }
+
+/// A plant that a command moves by `u_k + jump (u_k - u_(k-1))` in a tick, and the motion with these ends.
+#[test]
+fn the_motion_against_a_line_has_the_lines_amplitude_at_its_frequency() {
+    const FINE: usize = 50;
+    const TICKS: usize = 10_000;
+    for jump in [0.0, 0.05, 0.5, 5.0] {
+        for turn in [0.05, 0.4, 0.63, 1.2] {
+            let line = Line {
+                amplitude: [0.3, -0.4],
+                phase: [1.0, 0.0],
+                turn,
+                ..Line::default()
+            };
+            let end_um = |k: usize| line.end(k as f64, jump)[0];
+            let mut before_um = end_um(1) - end_um(0);
+            let (mut sum, mut farthest) = ([0.0; 2], 0.0_f64);
+            for k in 1..TICKS {
+                let (from_um, to_um) = (end_um(k), end_um(k + 1));
+                let command_um = (to_um - from_um + jump * before_um) / (1.0 + jump);
+                let jumped_um = from_um + jump * (command_um - before_um);
+                before_um = command_um;
+                for i in 0..FINE {
+                    let part = (i as f64 + 0.5) / FINE as f64;
+                    let at_um = jumped_um + part * (to_um - jumped_um);
+                    let t = k as f64 + part;
+                    let shown = unit(-turn * t).map(|x| x * at_um);
+                    sum = [sum[0] + shown[0], sum[1] + shown[1]];
+                    if k > TICKS / 2 {
+                        let left_um = line.at(t)[0] - at_um;
+                        farthest = farthest.max((line.left_um(-t, jump) - left_um).abs());
+                    }
+                }
+            }
+            let found = sum.map(|x| 2.0 * x / (FINE * (TICKS - 1)) as f64);
+            let off = square([found[0] - 0.3, found[1] + 0.4]).sqrt();
+            assert!(
+                off < 0.003 && farthest < 1e-3,
+                "{jump} {turn}: {off} {farthest}"
+            );
+        }
+    }
+}
