@@ -471,21 +471,22 @@ fn held_nm(line_um: f64, ticks: Ticks, seed: u64) -> f64 {
     let mut world = World::new(seed, Flow::Lines(100.0, line_um, 1));
     let preview = vec![0.0; controller.preview_len()];
     let mut chance = Random::new(seed ^ 0x5741_11ed);
-    let (mut at, mut waits, mut squares) = (0_i64, 0, Vec::new());
-    // Where the ticks before say that a tick comes.
-    let mut place = 0.0;
+    let (mut at, mut waits, mut squares) = (0_i64, -1, Vec::new());
+    // Where the ticks before say that a tick comes, and how late a late frame is, from the least to the most.
+    let (mut place, mut by) = (0.0, 0.0);
     for k in 1..20_000_i64 {
         // Of a late frame the timer makes one tick, and it comes within the next period.
-        if waits == 0 && chance.uniform() < 1e-3 * ticks.late_frames {
+        if waits < 0 && chance.uniform() < 1e-3 * ticks.late_frames {
             waits = 2;
+            by = chance.uniform();
         }
         waits = (waits - 1).max(-1);
         let frame = k as f64 * (1.0 + ticks.drift) * FINE as f64;
         let frame = frame.round() as i64;
         let uneven = ticks.uneven_steps * (2.0 * chance.uniform() - 1.0);
         let to = match waits {
-            1 => frame + 6,
-            0 => frame - 7,
+            1 => frame + 6 + (6.0 * by) as i64,
+            0 => frame - 7 + (7.0 * by) as i64,
             _ => frame + uneven.round() as i64,
         };
         while at < to {
@@ -496,7 +497,7 @@ fn held_nm(line_um: f64, ticks: Ticks, seed: u64) -> f64 {
             }
         }
         let since = (to as f64 - place) / FINE as f64;
-        let periods = since.round().max(1.0);
+        let periods = if since > 1.75 { since.round() } else { 1.0 };
         let late = since - periods;
         place += (periods + late / 16.0) * FINE as f64;
         (1..periods as u32).for_each(|_| controller.skip());
