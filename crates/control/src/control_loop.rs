@@ -259,6 +259,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         state.forward_um = driven.feed_forward_um;
         let limited = output.flags.range_limited || output.flags.slew_limited;
         output.dither_um = if limited { 0.0 } else { dither_um };
+        output.cancel_um = cancel_um;
         output.driven = Driven {
             jump_um: self.parts.model.feedthrough * change_um,
             limited,
@@ -273,13 +274,13 @@ impl<L: ControlLaw> ControlLoop<L> {
         } else {
             law.follow(&mut state.law, &tick.law, output.command_um * gain);
         }
-        // The feed-forward moves the model along the reference; what is learned makes the bead do the same, so the estimator is not
-        // told of it.
-        let hidden_um = learned_um;
-        self.estimator
-            .push(&mut state.estimator, (output.command_um - hidden_um) * gain);
+        // What is learned makes the bead follow the reference as the model does, so the estimator is not told of it.
+        self.estimator.push(
+            &mut state.estimator,
+            (output.command_um - learned_um) * gain,
+        );
         state.previous_um = output.command_um;
-        state.hidden_um = hidden_um;
+        state.hidden_um = learned_um;
         if state.adapt.is_some() {
             let estimate = &tick.law.estimate;
             let told = TickOutcome {
@@ -462,6 +463,7 @@ impl<L: ControlLaw> ControlLoop<L> {
             command_um: limited.command_um,
             requested_um,
             dither_um: 0.0,
+            cancel_um: 0.0,
             estimate_um: estimate.position_um,
             estimate_sd_um: estimate.position_sd_um,
             predicted_measurement_um: estimate.predicted_measurement_um,

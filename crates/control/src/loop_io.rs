@@ -102,6 +102,8 @@ pub struct LoopOutput {
     pub requested_um: f64,
     /// Part of the command that was drawn at random to learn the gain (dither), um; 0 where a limit changed the command.
     pub dither_um: f64,
+    /// Part of the command that cancels a periodic flow, um: the bead shows neither.
+    pub cancel_um: f64,
     /// Bead position now (just before the command takes effect), um.
     pub estimate_um: f64,
     /// Standard deviation of that estimate, um.

@@ -171,6 +171,8 @@ pub(super) struct Seen {
     pub command_um: f64,
     /// Its random part.
     pub dither_um: f64,
+    /// Its part that a periodic flow cancels, so that the bead does not follow it.
+    pub cancel_um: f64,
     /// Zero flow of the last quiet time.
     pub zero_flow_um: f64,
 }
@@ -193,6 +195,8 @@ pub(super) struct Following {
     commands_um: [f64; COMMANDS],
     known: usize,
     dithers_um: [f64; COMMANDS],
+    /// The commands without what a periodic flow cancels: the bead follows these.
+    follows_um: [f64; COMMANDS],
     one_sided: OneSided,
     mean_um: f64,
     mean_share: f64,
@@ -236,6 +240,7 @@ impl Following {
             commands_um: [0.0; COMMANDS],
             known: 0,
             dithers_um: [0.0; COMMANDS],
+            follows_um: [0.0; COMMANDS],
             one_sided: OneSided::new(sample_s),
             mean_um: 0.0,
             mean_share: (sample_s / MEAN_S).min(1.0),
@@ -264,6 +269,7 @@ impl Following {
             reference_um: f64::NAN,
             command_um: held_um,
             dither_um: self.dithers_um[0],
+            cancel_um: self.commands_um[0] - self.follows_um[0],
             zero_flow_um: f64::NAN,
         });
     }
@@ -284,6 +290,7 @@ impl Following {
         for (past_um, newest_um) in [
             (&mut self.commands_um, seen.command_um),
             (&mut self.dithers_um, seen.dither_um),
+            (&mut self.follows_um, seen.command_um - seen.cancel_um),
         ] {
             past_um.copy_within(..COMMANDS - 1, 1);
             past_um[0] = newest_um;
@@ -297,10 +304,11 @@ impl Following {
             return None;
         }
         self.remember(seen);
-        let Some((now_um, change_um)) = self.shown_um(&self.commands_um) else {
-            self.mean_um = seen.command_um;
+        let Some((commanded_um, change_um)) = self.shown_um(&self.commands_um) else {
+            self.mean_um = self.follows_um[0];
             return None;
         };
+        let (now_um, _) = self.shown_um(&self.follows_um)?;
         self.since_fix += 1.0;
         let shift_um = self.mean_share * (now_um - self.mean_um);
         self.mean_um += shift_um;
@@ -344,7 +352,7 @@ impl Following {
                 bead_um: position_um - beliefs.before_um,
                 usual_um2: beliefs.motion_um2,
                 dither_um: self.gain * dithered_um,
-                above: now_um - dithered_um > zero_flow_um,
+                above: commanded_um - dithered_um > zero_flow_um,
             });
         }
         let off_um = (position_um - seen.reference_um).abs();
@@ -388,8 +396,7 @@ impl Following {
                 return Some((Instead::Against, rest_um));
             }
         }
-        let goes = adrift.evidence > EVIDENCE && beliefs.compared.2;
-        if goes {
+        if adrift.evidence > EVIDENCE && beliefs.compared.2 {
             return Some((Instead::Adrift, adrift.zero_flow_um));
         }
         (self.one_sided.told()).then_some((Instead::OneSided, zero_flow_um))

@@ -92,6 +92,7 @@ impl<R: ReferenceGenerator> Core<R> {
             reference_um,
             command_um: output.command_um,
             dither_um: output.dither_um,
+            cancel_um: output.cancel_um,
             zero_flow_um: state.rest.zero_flow().um,
         });
         let pauses = state.following.pause_um().is_some();

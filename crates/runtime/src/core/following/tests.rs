@@ -20,6 +20,10 @@ struct World<'a> {
     reference: &'a dyn Fn(f64) -> f64,
     /// What is added to the command, um.
     added: &'a dyn Fn(f64) -> f64,
+    /// The same against a periodic flow.
+    cancels: &'a dyn Fn(f64) -> f64,
+    /// Ticks in which the actuator stands where it stood.
+    stands: &'a dyn Fn(u64) -> bool,
     /// Side of the dither, um of command, which changes at random every second tick.
     dither_um: f64,
     /// What the picture shakes by, um.
@@ -44,6 +48,8 @@ impl Default for World<'_> {
             zero_flow: &|_| 20.0,
             reference: &|_| 0.0,
             added: &|_| 0.0,
+            cancels: &|_| 0.0,
+            stands: &|_| false,
             dither_um: 0.0,
             shakes: &|_| 0.0,
             rings: None,
@@ -71,7 +77,7 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
     let (mut bead_um, mut zero_um, mut command_um) = (0.0, 20.0, 20.0_f64);
     let mut seen = std::collections::VecDeque::from(vec![0.0; late + 3]);
     let (mut reached_um, mut reached_um_per_s) = (20.0, 0.0);
-    let mut side_um = 0.0;
+    let (mut side_um, mut stood_um) = (0.0, 20.0);
     for k in 0..(world.seconds * world.rate_hz) as u64 {
         let t = k as f64 * dt;
         let [low_um, high_um] = (world.range)(t);
@@ -88,6 +94,10 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
             }
             asked_um = sum_um / f64::from(STEPS);
         }
+        if (world.stands)(k) {
+            asked_um = stood_um;
+        }
+        stood_um = asked_um;
         let pushed_um = asked_um - (world.zero_flow)(t);
         bead_um += world.axis * (world.gain_ratio)(t) * 380.0 * dt * pushed_um
             + (0.66 * dt).sqrt() * noise(&mut state);
@@ -115,13 +125,18 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
         }
         let dither_um = side_um - before_um;
         let driven_um = zero_um - 0.4 * error_um + (world.added)(t) + dither_um;
-        command_um = following.pause_um().unwrap_or(driven_um);
+        // The command of this tick is in force in the next one.
+        let cancel_um = (world.cancels)(t + dt);
+        let pause_um = following.pause_um();
+        command_um = pause_um.unwrap_or(driven_um + cancel_um);
+        let cancel_um = if pause_um.is_some() { 0.0 } else { cancel_um };
         command_um = command_um.clamp(0.0, 40.0);
         let found = following.step(&Seen {
             fix: Some((fix_um, 0.015_f64.powi(2))),
             reference_um,
             command_um,
             dither_um,
+            cancel_um,
             zero_flow_um: zero_um,
         });
         if let Some((instead, _)) = found {
@@ -404,5 +419,21 @@ fn fast_excitation_and_fixes_of_any_age_are_no_wrong_sign() {
                 }
             }
         }
+    }
+}
+
+/// A line of 100 Hz, 0.3 um of the bead, and an actuator that stands still for 4 ms now and then.
+#[test]
+fn a_flow_that_is_cancelled_and_an_actuator_that_stalls_are_no_wrong_sign() {
+    let line = |t: f64| 0.5 * (std::f64::consts::TAU * 100.0 * t).sin();
+    for seed in 1..=20 {
+        let found = found_by(&World {
+            seed,
+            zero_flow: &|t| 20.0 + line(t),
+            cancels: &line,
+            stands: &|k| k % 237 < 4,
+            ..World::default()
+        });
+        assert_eq!(found, None, "seed {seed}");
     }
 }
