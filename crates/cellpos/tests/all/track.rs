@@ -487,20 +487,3 @@ fn the_bead_is_found_where_the_zero_flow_has_drifted_since_it_was_measured() {
         );
     }
 }
-
-#[test]
-fn a_controller_file_without_dither_is_a_loop_that_does_not_adapt_and_that_is_said() {
-    let folder = tempfile::tempdir().unwrap();
-    succeed(
-        folder.path(),
-        "design --controller lqg --out controller.toml",
-    );
-    let path = folder.path().join("controller.toml");
-    let text = std::fs::read_to_string(&path).unwrap();
-    let text = text.replace("[estimator]", "[estimator]\ndither_percent = 0.0");
-    std::fs::write(&path, text).unwrap();
-    let line = "track --target 0um --clock virtual --controller controller.toml --duration 1s --no-record --json";
-    let ran = succeed(folder.path(), line);
-    assert!(ran.err.contains("dither_percent = 0"), "{}", ran.err);
-    assert!(ran.json()["adaptation"].is_null(), "{}", ran.json());
-}

@@ -16,6 +16,7 @@ mod pi_loop;
 mod solvers;
 mod state_feedback;
 mod stuck_bead;
+mod uneven;
 
 /// Counts by thread, so that tests beside each other do not disturb one another.
 #[global_allocator]

@@ -88,35 +88,20 @@ impl Searching<'_> {
             if last {
                 return Searched { found, problem };
             }
-            // The residual of a good fit is at least as good an estimate of the noise. One that is larger by more than the error of the
-            // floor is a misfit.
+            // The residual of a good fit tells the noise better than a short rest does: its size, and how much of it is a walk. One that is
+            // larger by more than the error of the floor is a misfit.
             let (residual, _) = ctx.residual(&found.fit);
-            let refined = refined(&noise, |noise| problem.unlikelihood(noise, &residual));
-            let changes = refined.innovation_um() / noise.innovation_um() - 1.0;
+            let next = refined(&noise, |noise| problem.unlikelihood(noise, &residual));
+            let changes = next.innovation_um() / noise.innovation_um() - 1.0;
+            let settled = problem.unlikelihood(&noise, &residual)
+                - problem.unlikelihood(&next, &residual)
+                < SETTLED;
             let error = if floor.rows > 0 {
                 error_of(floor.rows)
             } else {
                 0.0
             };
-            if changes > error {
-                return Searched { found, problem };
-            }
-            let next = if changes.abs() >= 0.03 {
-                refined
-            } else if found.fit.parts.is_empty() {
-                // The size of the floor stands. How much of it is a walk, a short rest tells worse than the whole records.
-                let size = (1.0 + changes).powi(-2);
-                NoiseModel {
-                    walk_um2: size * refined.walk_um2,
-                    white_um2: size * refined.white_um2,
-                    ..refined
-                }
-            } else {
-                return Searched { found, problem };
-            };
-            if problem.unlikelihood(&noise, &residual) - problem.unlikelihood(&next, &residual)
-                < SETTLED
-            {
+            if changes > error || settled {
                 return Searched { found, problem };
             }
             problem = problem.with_noise(next);
