@@ -66,8 +66,7 @@ fn frame_of(
 
 #[test]
 fn the_tracker_says_that_the_settings_will_not_hold_before_it_loses_the_bead() {
-    // Of each profile one ramp, and one of every kind.
-    ramps(|of, k| [(0, 0), (1, 1), (2, 2), (0, 3)].contains(&(of, k)));
+    ramps(|of, k| (of + k).is_multiple_of(2) && (of, k) != (0, 2));
 }
 
 #[test]
