@@ -83,21 +83,6 @@ fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn changed_frames() {
-    // As recorded, and each kind of change once.
-    changed_by(|n| [0, 2, 4, 8, 9, 11, 12].contains(&n));
-}
-
-#[test]
-#[cfg_attr(
-    not(no_shared_data),
-    ignore = "nightly: each change by every amount; the fast one has each kind"
-)]
-#[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
-fn changed_frames_by_every_amount() {
-    changed_by(|_| true);
-}
-
-fn changed_by(take: impl Fn(usize) -> bool) {
     // Blur of the frame and its shift, px.
     let rows = [
         ("as recorded", 0.0, 0.0, 0.0),
@@ -115,8 +100,7 @@ fn changed_by(take: impl Fn(usize) -> bool) {
         ("moved 2, blurred 1", 1.0, 0.9, 1.79),
     ];
     for mut lab in SETS.map(Lab::open) {
-        let taken = rows.into_iter().enumerate().filter(|(n, _)| take(*n));
-        for (_, (what, blur, dx, dy)) in taken {
+        for (what, blur, dx, dy) in rows {
             let spoil = |p: Picture| blurred(&p, blur).moved(dx, dy);
             let moved = |_: &Cut, p: (f64, f64)| [p, (p.0 + dx, p.1 + dy)];
             let row = lab.row(what, Picture::clone, spoil, moved);

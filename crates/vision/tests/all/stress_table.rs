@@ -332,24 +332,24 @@ fn the_whole_table_keeps_its_limits() {
 }
 
 /// Each way to spoil a picture with settings from such pictures and from clean ones; kinds of beads and noise in turn.
-fn few_rows(beads: f64, take: impl Fn(usize) -> bool) {
+fn few_rows(take: impl Fn(usize) -> bool) {
     let rows = (0..24).filter(|k| take(*k)).map(|k| {
         let snr = [40.0, 10.0, 200.0][k % 3];
         ((5 * k + k / 12) % 9, snr, SETTINGS[k / 12], ALL[k % 12])
     });
-    run(&rows.collect::<Vec<_>>(), beads);
+    run(&rows.collect::<Vec<_>>(), 100.0);
 }
 
 #[test]
 fn a_few_rows_of_the_table_keep_their_limits() {
     // Each way once, the settings in turn.
-    few_rows(40.0, |k| (k + k / 12).is_multiple_of(2));
+    few_rows(|k| (k + k / 12).is_multiple_of(2));
 }
 
 #[test]
-#[ignore = "slow: each way to spoil a picture with both settings and 100 beads; the fast one has each way once, with 40"]
+#[ignore = "slow: each way to spoil a picture with both settings; the fast one has each way once"]
 fn each_way_to_spoil_a_picture_with_both_settings_keeps_its_limits() {
-    few_rows(100.0, |_| true);
+    few_rows(|_| true);
 }
 
 #[test]
@@ -368,23 +368,17 @@ fn the_error_in_pictures_of_a_codec_is_stated() {
 
 #[test]
 fn a_profile_is_learnt_from_the_beads_that_it_fits() {
-    // Two beads in one region are as wide as one with its ring, and as many. Discs out of focus come in parts.
-    learnt_from_its_beads(20.0);
+    // Two beads in one region are as wide as one with its ring, and as many.
+    let rows = [(8, 40.0, Settings::Suggested, Spoil::Neighbours)];
+    run(&rows, 60.0);
 }
 
 #[test]
-#[ignore = "nightly: 60 beads a row; the fast one has 20"]
-fn a_profile_is_learnt_from_the_beads_that_it_fits_however_many() {
-    learnt_from_its_beads(60.0);
-}
-
-fn learnt_from_its_beads(beads: f64) {
-    let rows = [
-        (8, Settings::Suggested, Spoil::Neighbours),
-        (7, Settings::Suggested, Spoil::Defocus(1.15)),
-    ];
-    let rows = rows.map(|(kind, settings, spoil)| (kind, 40.0, settings, spoil));
-    run(&rows, beads);
+#[ignore = "nightly: discs that blur; the fast one has beads beside each other"]
+fn a_profile_is_learnt_from_discs_out_of_focus() {
+    // They come in parts.
+    let rows = [(7, 40.0, Settings::Suggested, Spoil::Defocus(1.15))];
+    run(&rows, 60.0);
 }
 
 #[test]
