@@ -5,7 +5,7 @@
 //! more the longer the lags are; the rest does not. Not for effects that are not linear: what is left of them at the driven lines and their
 //! harmonics is taken off, the remainder is in the rest.
 
-use realfft::RealFftPlanner;
+use cellpos_numeric::fft;
 
 use crate::candidate_model::CandidateModel;
 use crate::error::IdentError;
@@ -128,12 +128,7 @@ impl Rest {
         let pairs: f64 = weights.windows(2).map(|w| w[0] * w[1]).sum();
         let fourth: f64 = weights.iter().map(|w| w.powi(4)).sum();
         let rows = increments.len() as f64;
-        let plan = RealFftPlanner::<f64>::new().plan_fft_forward(increments.len());
-        let mut spectrum = plan.make_output_vec();
-        // Only wrong lengths are errors, and the plan made the buffers.
-        if plan.process(&mut increments, &mut spectrum).is_err() {
-            return Vec::new();
-        }
+        let spectrum = fft::forward(&mut increments);
         let bin_hz = 1.0 / (rows * period_s);
         let mut octaves: Vec<(usize, Scatter)> = Vec::new();
         for (bin, value) in spectrum.iter().enumerate().skip(3) {

@@ -4,8 +4,8 @@
 //! H1 is biased in closed loop, because the input carries the output's noise. For records with a known excitation use
 //! [`crate::frequency_response`].
 
+use cellpos_numeric::fft;
 use nalgebra::Complex;
-use realfft::RealFftPlanner;
 
 use crate::frequency_response::FrequencyPoint;
 use crate::tone_fit::{ToneFit, Whitening, fit_block};
@@ -126,18 +126,12 @@ fn hann(n: usize) -> Vec<f64> {
 }
 
 fn windowed_spectrum(signal: &[f64]) -> Vec<Complex<f64>> {
-    let plan = RealFftPlanner::<f64>::new().plan_fft_forward(signal.len());
     let mut input: Vec<f64> = signal
         .iter()
         .zip(hann(signal.len()))
         .map(|(x, w)| x * w)
         .collect();
-    let mut output = plan.make_output_vec();
-    match plan.process(&mut input, &mut output) {
-        Ok(()) => output.iter().map(|c| Complex::new(c.re, c.im)).collect(),
-        // Only wrong lengths are errors, and the plan made the buffers.
-        Err(_) => Vec::new(),
-    }
+    fft::forward(&mut input)
 }
 
 fn strongest(residual: &[f64], period_s: f64) -> Option<f64> {

@@ -1,4 +1,5 @@
-//! Numerical tools shared by all crates: [`units`], seeded random numbers, order [`statistics`], distributions, and a [`parallel`] map.
+//! Numerical tools shared by all crates: [`units`], seeded random numbers, order [`statistics`], distributions, the [`fft`],
+//! and a [`parallel`] map.
 //!
 //! Each tool exists only here, so that two crates cannot disagree about the meaning of a quantile or a seed. This is not a statistics
 //! library: distribution functions come from `statrs`.
@@ -11,6 +12,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod fft;
 pub mod parallel;
 mod random;
 pub mod statistics;

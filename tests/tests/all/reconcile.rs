@@ -44,6 +44,7 @@ fn jumps_of_the_bead_are_named_with_rate_and_size_alone_and_beside_another_effec
 }
 
 #[test]
+#[ignore = "nightly: a quarter of a minute; the fast ones get a formula for a fan and a measured circuit"]
 fn a_line_off_the_mains_is_unknown_with_a_formula_that_holds_on_held_out_data() {
     let result = run(&hiding(Hidden::Line(37.0, 0.15), 12)).unwrap();
     assert_eq!(result.verdict, Verdict::Unknown);

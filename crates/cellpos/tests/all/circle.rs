@@ -217,6 +217,7 @@ fn a_run_of_track_is_data_wherever_its_bead_rested() {
 
 /// Ordinary runs in closed loop of a rig whose bead moves by less than its model says: each shows by how much, and nothing beside it.
 #[test]
+#[ignore = "nightly: two more sources of records; the fast ones have the survey of circle and the runs that reconcile collects"]
 fn a_sine_of_track_and_a_script_each_show_what_their_rig_hides() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

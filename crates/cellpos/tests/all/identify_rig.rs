@@ -50,6 +50,7 @@ fn a_log_sweep_finds_gain_and_delay_too() {
 }
 
 #[test]
+#[ignore = "nightly: ten lines on a rig file; the fast ones have five, and ten without a rig file"]
 fn on_the_rig_of_a_rig_toml_the_same_plant_comes_out_through_the_loop_of_track() {
     let folder = tempfile::tempdir().unwrap();
     rig(folder.path(), "rig.toml", "[emulator]\nseed = 3\n");
@@ -167,6 +168,7 @@ fn a_camera_later_than_the_rig_file_says_is_measured_and_the_file_is_said_to_be_
 const FEW: &str = "--frequency 5Hz,10Hz,20Hz,50Hz,120Hz --bootstrap 0 --led-edges 0 --json --out m.toml --report r.html";
 
 #[test]
+#[ignore = "nightly: 6 s of a debug build; the fast one loses the bead for good and goes on with another"]
 fn a_segment_in_which_the_bead_was_lost_is_measured_again() {
     let folder = tempfile::tempdir().unwrap();
     rig(
@@ -186,6 +188,7 @@ fn a_segment_in_which_the_bead_was_lost_is_measured_again() {
 }
 
 #[test]
+#[ignore = "nightly: 4 s of a debug build; the fast one goes on after a wrong sign"]
 fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
     let folder = tempfile::tempdir().unwrap();
     rig(

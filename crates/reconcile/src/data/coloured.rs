@@ -5,7 +5,7 @@
 //! an error. Not for lines: a line is no noise, and a fit that leaves one is refused.
 
 use crate::data::noise::{Coloured, NoiseModel, Whitener};
-use realfft::RealFftPlanner;
+use cellpos_numeric::fft;
 
 /// Which noise the records are taken to have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -132,12 +132,11 @@ fn coloured(alone: &Alone<'_>) -> Option<(Shape, f64)> {
 fn is_white(alone: &Alone<'_>, noise: &NoiseModel) -> bool {
     let mut e = vec![0.0; alone.values.len()];
     Whitener::new(noise, alone.counts, None).apply(alone.values, &mut e);
-    let plan = RealFftPlanner::<f64>::new().plan_fft_forward(e.len());
-    let mut spectrum = plan.make_output_vec();
-    if plan.process(&mut e, &mut spectrum).is_err() {
-        return false;
-    }
-    let powers: Vec<f64> = spectrum.iter().skip(1).map(|x| x.norm_sqr()).collect();
+    let powers: Vec<f64> = fft::forward(&mut e)
+        .iter()
+        .skip(1)
+        .map(|x| x.norm_sqr())
+        .collect();
     let mean = powers.iter().sum::<f64>() / powers.len().max(1) as f64;
     powers.iter().all(|p| *p < LINE * mean)
 }

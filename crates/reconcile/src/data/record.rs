@@ -2,7 +2,7 @@
 
 use crate::error::ReconcileError;
 use crate::thresholds::THRESHOLDS;
-use realfft::RealFftPlanner;
+use cellpos_numeric::fft;
 
 /// One record on an even grid.
 #[derive(Debug, Clone, PartialEq)]
@@ -226,7 +226,7 @@ impl Record {
             return None;
         }
         let limit = THRESHOLDS.repeat_share.powi(2) * power;
-        let apart = differences(u)?;
+        let apart = differences(u);
         let mut away = false;
         for p in 1..=n / 2 {
             // The command must have gone somewhere before it can be said to have come back.
@@ -290,7 +290,7 @@ pub(crate) fn variance(x: &[f64]) -> f64 {
 }
 
 /// Mean square of `x_k - x_(k-p)` for every shift p up to half the length, through the autocorrelation.
-pub(crate) fn differences(x: &[f64]) -> Option<Vec<f64>> {
+pub(crate) fn differences(x: &[f64]) -> Vec<f64> {
     let n = x.len();
     let mean = x.iter().sum::<f64>() / n as f64;
     let size = (2 * n).next_power_of_two();
@@ -298,17 +298,12 @@ pub(crate) fn differences(x: &[f64]) -> Option<Vec<f64>> {
     for (p, v) in padded.iter_mut().zip(x) {
         *p = v - mean;
     }
-    let mut planner = RealFftPlanner::<f64>::new();
-    let forward = planner.plan_fft_forward(size);
-    let mut spectrum = forward.make_output_vec();
     let squares: Vec<f64> = padded[..n].iter().map(|v| v * v).collect();
-    forward.process(&mut padded, &mut spectrum).ok()?;
+    let mut spectrum = fft::forward(&mut padded);
     for s in &mut spectrum {
         *s = (s.norm_sqr()).into();
     }
-    let inverse = planner.plan_fft_inverse(size);
-    let mut correlation = inverse.make_output_vec();
-    inverse.process(&mut spectrum, &mut correlation).ok()?;
+    let correlation = fft::inverse(&mut spectrum, size);
     let (mut head, mut tail) = (squares.iter().sum::<f64>(), squares.iter().sum::<f64>());
     let mut out = Vec::with_capacity(n / 2 + 1);
     for p in 0..=n / 2 {
@@ -319,7 +314,7 @@ pub(crate) fn differences(x: &[f64]) -> Option<Vec<f64>> {
         let r = correlation[p] / size as f64;
         out.push(((head + tail - 2.0 * r) / (n - p) as f64).max(0.0));
     }
-    Some(out)
+    out
 }
 
 /// Sorts records by their content, so that the order of the files does not matter, and joins parts of one record. A part belongs

@@ -42,7 +42,7 @@ pub(crate) fn repeats(r: &Record) -> Option<Repeats> {
     if n < 3 * THRESHOLDS.floor_rows || power <= 0.0 {
         return None;
     }
-    let apart = differences(&r.pzt_um)?;
+    let apart = differences(&r.pzt_um);
     let mut lags: Vec<usize> = (20..apart.len().saturating_sub(1))
         .filter(|&p| apart[p] < apart[p - 1] && apart[p] < apart[p + 1])
         .collect();

@@ -116,6 +116,7 @@ fn averaging_over_the_exposure_is_told_from_a_delay_by_the_noise() {
 }
 
 #[test]
+#[ignore = "nightly: a quarter of a minute; the fast one names a delay"]
 fn a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative() {
     expect("driver-lag", &["driver-lag"]);
 }
@@ -136,6 +137,7 @@ fn leak_and_hum_together_are_both_named() {
 }
 
 #[test]
+#[ignore = "nightly: the fast ones are the other records that hide nothing"]
 fn records_that_hide_nothing_get_no_name() {
     expect("none-1", &[]);
 }

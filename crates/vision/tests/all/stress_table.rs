@@ -368,12 +368,16 @@ fn the_error_in_pictures_of_a_codec_is_stated() {
 
 #[test]
 fn a_profile_is_learnt_from_the_beads_that_it_fits() {
-    // Two beads in one region are as wide as one with its ring, and as many. Discs out of focus come in parts.
-    let rows = [
-        (8, Settings::Suggested, Spoil::Neighbours),
-        (7, Settings::Suggested, Spoil::Defocus(1.15)),
-    ];
-    let rows = rows.map(|(kind, settings, spoil)| (kind, 40.0, settings, spoil));
+    // Two beads in one region are as wide as one with its ring, and as many.
+    let rows = [(8, 40.0, Settings::Suggested, Spoil::Neighbours)];
+    run(&rows, 60.0);
+}
+
+#[test]
+#[ignore = "nightly: discs that blur; the fast one has beads beside each other"]
+fn a_profile_is_learnt_from_discs_out_of_focus() {
+    // They come in parts.
+    let rows = [(7, 40.0, Settings::Suggested, Spoil::Defocus(1.15))];
     run(&rows, 60.0);
 }
 

@@ -157,16 +157,28 @@ fn the_error_is_what_the_covariance_says_on_pictures_that_the_template_does_not_
         Spoilt::Larger(1.1),
         Spoilt::Larger(0.9),
         Spoilt::Blurred(0.8),
-        Spoilt::Blurred(1.5),
         Spoilt::Steps(8.0),
         Spoilt::Steps(24.0),
         Spoilt::Saturated(170.0),
-        Spoilt::Saturated(160.0),
         Spoilt::Compressed(10.0),
-        Spoilt::Compressed(20.0),
         Spoilt::Compressed(30.0),
         Spoilt::Compressed(80.0),
     ];
+    the_error_is_what_the_covariance_says(&cases);
+}
+
+#[test]
+#[ignore = "nightly: what comes near a bound takes 2500 frames a case; the fast one has the ten others"]
+fn the_error_is_what_the_covariance_says_where_it_is_near_a_bound() {
+    let cases = [
+        Spoilt::Blurred(1.5),
+        Spoilt::Saturated(160.0),
+        Spoilt::Compressed(20.0),
+    ];
+    the_error_is_what_the_covariance_says(&cases);
+}
+
+fn the_error_is_what_the_covariance_says(cases: &[Spoilt]) {
     let found: Vec<_> = cases.iter().map(|case| (case, ratio(*case))).collect();
     for (case, (ratio, rms)) in &found {
         println!("{case:?}: error over stated {ratio:.2}, RMS {rms:.4} px");

@@ -1,6 +1,6 @@
 //! Spectrum of the error.
 
-use realfft::{RealFftPlanner, RealToComplex};
+use cellpos_numeric::fft::{self, RealToComplex};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
@@ -67,7 +67,7 @@ impl std::fmt::Debug for Stretches {
 impl Stretches {
     fn of(rows: usize) -> Self {
         Self {
-            fft: RealFftPlanner::<f64>::new().plan_fft_forward(rows),
+            fft: fft::plan(rows),
             window: (0..rows)
                 .map(|k| 0.5 - 0.5 * (TAU * k as f64 / rows as f64).cos())
                 .collect(),

@@ -287,6 +287,43 @@ fn no_test_that_lacks_its_records_is_green() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// `.ci/nightly` asks the test programs for what they ignore: all of it but tests of this name, and programs that need a feature.
+const DRAWS: &str = "draw_";
+
+#[test]
+fn an_ignored_test_says_why_and_the_nightly_run_has_it() {
+    let nightly = std::fs::read_to_string(root().join(".ci/nightly")).unwrap();
+    assert!(nightly.contains(&format!("NOT_TESTS = \"{DRAWS}\"")));
+    let (mut ignored, mut drawing) = (0, Vec::new());
+    for package in packages() {
+        let manifest = std::fs::read_to_string(root().join(&package).join("Cargo.toml")).unwrap();
+        let manifest: toml::Table = manifest.parse().unwrap();
+        let programs = manifest.get("test").and_then(|tests| tests.as_array());
+        for program in programs.into_iter().flatten() {
+            let script = program["name"].as_str().unwrap().replace('_', "-") + ".sh";
+            let is_always_built = program.get("required-features").is_none();
+            assert!(is_always_built || nightly.contains(&script), "{script}");
+        }
+        let mut files = Vec::new();
+        sources(&root().join(&package), &mut files);
+        for file in files {
+            let text = std::fs::read_to_string(&file).unwrap();
+            assert!(!text.contains(concat!("#[ign", "ore]")), "{file:?}");
+            let mut is_ignored = false;
+            for line in text.lines().map(str::trim_start) {
+                is_ignored |= line.contains(concat!("ignore", " = \""));
+                if let Some(name) = line.strip_prefix("fn ").filter(|_| is_ignored) {
+                    is_ignored = false;
+                    ignored += 1;
+                    drawing.extend(name.starts_with(DRAWS).then(|| name.to_owned()));
+                }
+            }
+        }
+    }
+    assert!(ignored > 100, "{ignored} tests are ignored");
+    assert_eq!(drawing, ["draw_the_outlines_of_the_documentation() {"]);
+}
+
 #[test]
 fn a_circle_is_found_where_there_is_one() {
     let folder = tempfile::tempdir().unwrap();

@@ -79,7 +79,7 @@ fn broken(row: &Row, held: &Held, unseen_s: f64) -> bool {
 
 #[test]
 fn flows_that_step_at_the_worst_moment_take_no_bead() {
-    worst_moments(&["lqg", "own"], 1..=1);
+    worst_moments(&["own"], 1..=1);
 }
 
 #[test]
@@ -109,35 +109,43 @@ fn worst_moments(laws: &[&'static str], seeds: RangeInclusive<u64>) {
 
 #[test]
 fn a_flow_that_steps_while_a_script_moves_the_bead_takes_it_from_no_law() {
+    steps_during_moves(&[("lqg", -379.0), ("pi", 114.0)]);
+}
+
+#[test]
+#[ignore = "nightly: every law with both flows; the fast one has two laws with one each"]
+fn flows_that_step_while_a_script_moves_the_bead_take_it_from_no_law() {
+    let rows = LAWS.map(|law| [(law, 114.0), (law, -379.0)]);
+    steps_during_moves(rows.as_flattened());
+}
+
+/// Law and speed of the flow, um/s.
+fn steps_during_moves(rows: &[(&'static str, f64)]) {
     let script = "name = \"moves\"\nstart = \"-5um\"\n[[step]]\ndo = \"hold\"\nduration = \"1s\"\n\
          [[step]]\ndo = \"repeat\"\ntimes = 100\n\
          [[step.step]]\ndo = \"move\"\nto = \"5um\"\nduration = \"10ms\"\nshape = \"constant-velocity\"\n\
          [[step.step]]\ndo = \"move\"\nto = \"-5um\"\nduration = \"10ms\"\nshape = \"constant-velocity\"\n";
-    for law in LAWS {
-        for um_per_s in [114.0, -379.0] {
-            let row = Row {
-                events: vec![(FaultKind::FlowStep, 0.2)],
-                ..Row::step(law, um_per_s)
-            };
-            for seed in 1..=1 {
-                let ticks = follow(&row, seed, script.to_owned());
-                let after = || {
-                    ticks
-                        .iter()
-                        .filter(|t| t.is_running() && t.time_ns > 2_550_000_000)
-                };
-                let off_um = |t: &cellpos_runtime::TickRecord| (t.true_um - t.target_um).abs();
-                let worst_um = after().map(off_um).fold(0.0, f64::max);
-                let last_um = after().next_back().map_or(f64::NAN, off_um);
-                println!("{law}, {um_per_s} um/s during moves, seed {seed}: {worst_um:.2} um");
-                // A flow that starts within a move of 1 mm/s is told when the bead turns, after 10 ms at most.
-                let most_um =
-                    Limits::of_the_loop().furthest_um(&row) + 1.3 * f64::abs(um_per_s) * 0.01;
-                assert!(
-                    worst_um < most_um && last_um < most_um,
-                    "{law}, {um_per_s} um/s, seed {seed}: {worst_um} of {most_um} um"
-                );
-            }
-        }
+    for &(law, um_per_s) in rows {
+        let row = Row {
+            events: vec![(FaultKind::FlowStep, 0.2)],
+            ..Row::step(law, um_per_s)
+        };
+        let seed = 1;
+        let ticks = follow(&row, seed, script.to_owned());
+        let after = || {
+            ticks
+                .iter()
+                .filter(|t| t.is_running() && t.time_ns > 2_550_000_000)
+        };
+        let off_um = |t: &cellpos_runtime::TickRecord| (t.true_um - t.target_um).abs();
+        let worst_um = after().map(off_um).fold(0.0, f64::max);
+        let last_um = after().next_back().map_or(f64::NAN, off_um);
+        println!("{law}, {um_per_s} um/s during moves, seed {seed}: {worst_um:.2} um");
+        // A flow that starts within a move of 1 mm/s is told when the bead turns, after 10 ms at most.
+        let most_um = Limits::of_the_loop().furthest_um(&row) + 1.3 * f64::abs(um_per_s) * 0.01;
+        assert!(
+            worst_um < most_um && last_um < most_um,
+            "{law}, {um_per_s} um/s, seed {seed}: {worst_um} of {most_um} um"
+        );
     }
 }

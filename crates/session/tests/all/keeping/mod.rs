@@ -56,12 +56,22 @@ fn steps_of_the_flow_and_stalls_keep_the_bead_under_every_law_and_the_last_word_
 /// Commands that are to stop such a flow move both beads by more than lies between them, before the tracker knows how much of a command acts.
 #[test]
 fn a_fast_flow_and_the_commands_against_it_take_no_bead_beside_another() {
+    fast_flow_beside_another(&[1021]);
+}
+
+#[test]
+#[ignore = "nightly: another seed; the fast one has one"]
+fn a_fast_flow_and_the_commands_against_it_take_no_bead_beside_another_either() {
+    fast_flow_beside_another(&[1036]);
+}
+
+fn fast_flow_beside_another(seeds: &[u64]) {
     let row = Row {
         second_um: Some(1.5),
         ..Row::step("lqg", -985.0)
     };
     let limits = Limits::of_the_loop();
-    for seed in [1021, 1036] {
+    for &seed in seeds {
         let held = hold(&row.clone().again(5), seed);
         let broken = limits.broken(&row, &held);
         assert!(broken.is_empty(), "seed {seed}: {broken:#?}");
@@ -90,17 +100,25 @@ fn a_run_that_did_not_keep_its_bead_says_so_whatever_the_reason() {
 
 #[test]
 fn the_stated_error_counts_the_moments_without_a_fix_as_they_were() {
-    let limits = Limits::of_the_loop();
-    let rows = [
+    without_a_fix(&[Row::to_the_end("lqg", "lose-bead")]);
+}
+
+#[test]
+#[ignore = "nightly: each law without frames in its own way; the fast one loses the bead under LQG"]
+fn the_stated_error_counts_the_moments_without_a_fix_whatever_the_reason() {
+    without_a_fix(&[
         Row::to_the_end("pi", "stall-camera"),
-        Row::to_the_end("lqg", "lose-bead"),
         Row::event("mpc", "drop-frames", 0.4),
-    ];
+    ]);
+}
+
+fn without_a_fix(rows: &[Row]) {
+    let limits = Limits::of_the_loop();
     for row in rows {
-        let runs: Vec<Held> = (1..=12).map(|seed| hold(&row, seed)).collect();
+        let runs: Vec<Held> = (1..=12).map(|seed| hold(row, seed)).collect();
         let all: Vec<&Held> = runs.iter().collect();
-        println!("{row} | {}", limits.counts(&row, &all));
-        assert_eq!(limits.stated(&row, &all), None, "{row}");
+        println!("{row} | {}", limits.counts(row, &all));
+        assert_eq!(limits.stated(row, &all), None, "{row}");
     }
 }
 
@@ -190,8 +208,18 @@ fn a_silent_line_takes_the_bead_hardly_further_than_a_pzt_that_stands_still() {
 
 #[test]
 fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sight() {
+    clips_below(&[19.98]);
+}
+
+#[test]
+#[ignore = "nightly: a lower limit; the fast one has that which is harder to see"]
+fn an_amplifier_that_clips_lower_is_said_under_every_law_too() {
+    clips_below(&[19.9]);
+}
+
+fn clips_below(clips_um: &[f64]) {
     for (seed, law) in LAWS.into_iter().enumerate() {
-        for clip_um in [19.9, 19.98] {
+        for &clip_um in clips_um {
             let row = Row {
                 ideal: false,
                 ..Row::clipped(law, clip_um)
@@ -210,12 +238,18 @@ fn an_amplifier_that_clips_is_said_under_every_law_before_the_bead_is_out_of_sig
 
 #[test]
 fn an_amplifier_that_clips_just_above_zero_flow_is_said_though_the_bead_is_held() {
-    for (seed, law, clip_um) in [
-        (11, "lqg", 20.01),
-        (13, "mpc", 20.01),
-        (14, "own", 20.01),
-        (15, "lqg", 20.02),
-    ] {
+    clips_just_above(&[(15, "lqg", 20.02)]);
+}
+
+#[test]
+#[ignore = "nightly: the other laws; the fast one has LQG and the higher limit"]
+fn an_amplifier_that_clips_just_above_zero_flow_is_said_under_every_law() {
+    clips_just_above(&[(11, "lqg", 20.01), (13, "mpc", 20.01), (14, "own", 20.01)]);
+}
+
+/// Seed, law and the amplifier's limit, um.
+fn clips_just_above(rows: &[(u64, &'static str, f64)]) {
+    for &(seed, law, clip_um) in rows {
         let row = Row {
             seconds: 20.0,
             ideal: false,
@@ -253,12 +287,18 @@ fn pi_pushes_less_and_is_held_beside_a_clip_or_ends_with_a_reason() {
 
 #[test]
 fn steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms_under_every_law() {
-    for (law, count, most_ms) in [
-        ("lqg", 100, 12.0),
-        ("mpc", 20, 12.0),
-        ("pi", 100, 12.0),
-        ("own", 20, 12.0),
-    ] {
+    steps_of_10_um(&["lqg", "mpc", "pi", "own"], 20);
+}
+
+#[test]
+#[ignore = "nightly: a hundred steps; the fast one has twenty"]
+fn a_hundred_steps_of_10_um_refuse_no_fix_and_are_over_in_12_ms() {
+    steps_of_10_um(&["lqg", "pi"], 100);
+}
+
+fn steps_of_10_um(laws: &[&'static str], count: usize) {
+    let most_ms = 12.0;
+    for &law in laws {
         let steps = steps::go(law, 1, count, 1.0);
         let worst_ms = steps.settled_ms.iter().copied().fold(0.0, f64::max);
         println!(
