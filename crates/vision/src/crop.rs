@@ -35,6 +35,8 @@ pub(crate) struct Crop {
     holes_used: usize,
     /// Grey level taken off every pixel, so that single precision loses nothing.
     pub pedestal: f32,
+    /// Step of the grey levels.
+    step: f32,
 }
 
 impl Crop {
@@ -50,6 +52,7 @@ impl Crop {
             holes: [(0, 0); MOST_HOLES],
             holes_used: 0,
             pedestal: 0.0,
+            step: 1.0,
         }
     }
 
@@ -75,6 +78,8 @@ impl Crop {
         };
         if copied {
             self.take_off_pedestal();
+            // After a slope of the light is taken off, the levels have no steps.
+            self.step = self.grey_step();
         }
         copied
     }
@@ -137,7 +142,7 @@ impl Crop {
 
     fn take_off_pedestal(&mut self) {
         let (mut sum, mut count) = (0.0, 0.0_f32);
-        self.border(|v, _| {
+        self.border(|v, _, _| {
             sum += v;
             count += 1.0;
         });
@@ -150,8 +155,8 @@ impl Crop {
         }
     }
 
-    /// Visits the pixels along the window's border; the second argument tells whether the one before was its neighbour.
-    fn border(&self, mut visit: impl FnMut(f32, bool)) {
+    /// Visits the pixels along the window's border: value, row and column, and whether the one before was its neighbour.
+    fn border(&self, mut visit: impl FnMut(f32, (usize, usize), bool)) {
         let (last_row, last_column) = (self.height.saturating_sub(1), self.width.saturating_sub(1));
         for j in [0, last_row] {
             for (i, v) in self.rows[j.min(MAX_WINDOW_PX - 1)]
@@ -159,37 +164,42 @@ impl Crop {
                 .enumerate()
                 .take(self.width)
             {
-                visit(*v, i > 0);
+                visit(*v, (j, i), i > 0);
             }
         }
         for i in [0, last_column] {
             for (j, row) in self.rows.iter().enumerate().take(last_row).skip(1) {
-                visit(row[i.min(STRIDE - 1)], j > 1);
+                visit(row[i.min(STRIDE - 1)], (j, i), j > 1);
             }
         }
     }
 
-    /// Noise variance of a pixel from differences of neighbours along the border, grey levels squared, and its degrees of freedom.
-    /// Differences are blind to uneven light; those above four times the mean (another bead's edge) are left out, but none of one
-    /// step of the grey levels. The rounding to such steps is the least noise.
-    pub(crate) fn noise_variance(&self) -> (f64, f64) {
-        let step = self.grey_step();
+    /// Noise variance of a pixel, grey levels squared, and its degrees of freedom, from differences of neighbours along the border after
+    /// a model is taken off. Differences are blind to uneven light; those above four times the mean (another bead's edge) are left
+    /// out, but none of one step of the grey levels. The rounding to such steps is the least noise.
+    pub(crate) fn noise_variance(&self, model: impl Fn(usize, usize) -> f32) -> (f64, f64) {
+        let (mut differences, mut all) = ([0.0_f32; 4 * MAX_WINDOW_PX], 0);
+        let mut previous = 0.0;
+        self.border(|v, (j, i), neighbour| {
+            let v = v - model(j, i);
+            if neighbour && let Some(d) = differences.get_mut(all) {
+                *d = (v - previous).abs();
+                all += 1;
+            }
+            previous = v;
+        });
         let (mut limit, mut variance, mut used) = (f32::INFINITY, 0.0, 0.0);
         for _ in 0..2 {
-            let (mut previous, mut sum, mut squares, mut count) = (0.0, 0.0, 0.0, 0.0_f32);
-            self.border(|v, neighbour| {
-                let d = (v - previous).abs();
-                previous = v;
-                if neighbour && d < limit {
-                    sum += d;
-                    squares += d * d;
-                    count += 1.0;
-                }
-            });
-            limit = (4.0 * sum / count.max(1.0)).max(1.5 * step);
+            let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0_f32);
+            for d in differences.iter().take(all).filter(|d| **d < limit) {
+                sum += d;
+                squares += d * d;
+                count += 1.0;
+            }
+            limit = (4.0 * sum / count.max(1.0)).max(1.5 * self.step);
             (variance, used) = (0.5 * squares / count.max(1.0), count);
         }
-        let rounding = ROUNDING_VARIANCE * f64::from(step * step);
+        let rounding = ROUNDING_VARIANCE * f64::from(self.step * self.step);
         (f64::from(variance).max(rounding), FREEDOM * f64::from(used))
     }
 
@@ -205,7 +215,7 @@ impl Crop {
                 step = d;
             }
         };
-        self.border(&mut look);
+        self.border(|v, _, neighbour| look(v, neighbour));
         let middle = self.rows.get(self.height / 2).into_iter().flatten();
         for (i, v) in middle.take(self.width).enumerate() {
             look(*v, i > 0);

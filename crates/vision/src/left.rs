@@ -144,7 +144,7 @@ pub(crate) fn examine(
             );
             strongest = strongest.max(r.abs());
             brightest = brightest.max(in_core(f) * (r + f * amplitude).abs());
-            row.add(r, u, f, (fx, fy), (u + (u0 - x), dy), four(&away));
+            row.add(r, (u, m), f, (fx, fy), (u + (u0 - x), dy), four(&away));
             let columns = column_sums.iter_mut().zip(&mut column_derivatives).skip(k);
             for ((sum, derivative), (r, fx)) in
                 columns.zip(r.to_array().into_iter().zip(fx.to_array()))
@@ -245,7 +245,7 @@ impl Moments {
     fn add(
         &mut self,
         r: f32x4,
-        u: f32x4,
+        (u, m): (f32x4, f32x4),
         f: f32x4,
         (fx, fy): (f32x4, f32x4),
         (dx, dy): (f32x4, f32),
@@ -274,7 +274,7 @@ impl Moments {
         self.uu += u * u;
         self.weighted += (xx + yy) * r * r;
         self.beside += away * r;
-        self.count += f32x4::ONE;
+        self.count += m;
     }
 
     /// A row at a distance from the middle one.

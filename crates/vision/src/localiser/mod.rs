@@ -107,6 +107,19 @@ struct Fitted {
     left: Left,
 }
 
+impl Fitted {
+    fn of((x_px, y_px): (f64, f64), pass: Pass, converged: bool) -> Self {
+        Fitted {
+            x_px,
+            y_px,
+            pass,
+            converged,
+            left: Left::default(),
+            slope: (0.0, 0.0),
+        }
+    }
+}
+
 impl Localiser {
     /// Makes the buffers and the template.
     ///
@@ -324,14 +337,19 @@ impl Localiser {
         let whole = side_px == self.config.window_px && self.comb.is_still();
         if whole || self.noise_variance.is_none() {
             self.read_noise();
-            if whole && !view.is_draft {
-                self.keep_noise();
-            }
         }
         if !self.comb.is_still() {
             fitted = self.fit_length(view, fitted, side_px);
         }
         let fitted = self.refine(view, fitted, (x_px, y_px), side_px);
+        if whole {
+            if let Some(f) = &fitted {
+                self.explain_noise(f);
+            }
+            if !view.is_draft {
+                self.keep_noise();
+            }
+        }
         let found = fitted.as_ref().map(|f| f.pass);
         let left = fitted.as_ref().map_or(Left::default(), |f| f.left);
         let slope = fitted.as_ref().map_or((0.0, 0.0), |f| f.slope);
@@ -462,14 +480,7 @@ impl Localiser {
             if off_centre > RECENTRE_PX && recentres < max_recentres {
                 let (x0, y0) = (self.crop.x0, self.crop.y0);
                 if !self.take_window(view, x_px, y_px, side_px) {
-                    return Some(Fitted {
-                        x_px,
-                        y_px,
-                        pass,
-                        converged: false,
-                        left: Left::default(),
-                        slope: (0.0, 0.0),
-                    });
+                    return Some(Fitted::of((x_px, y_px), pass, false));
                 }
                 recentres += 1;
                 if (x0, y0) != (self.crop.x0, self.crop.y0) {
@@ -477,23 +488,9 @@ impl Localiser {
                 }
             }
             if at_rest {
-                return Some(Fitted {
-                    x_px,
-                    y_px,
-                    pass,
-                    converged: true,
-                    left: Left::default(),
-                    slope: (0.0, 0.0),
-                });
+                return Some(Fitted::of((x_px, y_px), pass, true));
             }
         }
-        before.map(|pass| Fitted {
-            x_px,
-            y_px,
-            pass,
-            converged: false,
-            left: Left::default(),
-            slope: (0.0, 0.0),
-        })
+        before.map(|pass| Fitted::of((x_px, y_px), pass, false))
     }
 }

@@ -1,11 +1,13 @@
 //! Noise of the pixels, and the weights of a fit that follow from it.
 
-use super::Localiser;
+use super::{Fitted, Localiser};
 use crate::config::PixelNoise;
 use crate::fit::{Pass, Weights};
 
 /// Degrees of freedom of the noise in the smallest window that a frame may hold, 5 x 5 px.
 const LEAST_FREEDOM: f64 = 8.0;
+/// A fit explains the border if it leaves less than this share of its variance: chance and specks take off less.
+const EXPLAINED: f64 = 0.3;
 
 impl Localiser {
     /// Puts the noise about the bead into force: that of its own window, as far as the windows of the last fixes differ.
@@ -13,11 +15,34 @@ impl Localiser {
         self.noise_variance = Some(match self.config.noise {
             PixelNoise::Known { read_sd_grey, .. } => read_sd_grey * read_sd_grey,
             PixelNoise::Estimated => {
-                let (variance, freedom) = self.crop.noise_variance();
+                let (variance, freedom) = self.crop.noise_variance(|_, _| 0.0);
                 self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
                 self.noises.moderate(self.noise_here.0, self.noise_here.1)
             }
         });
+    }
+
+    /// Reads the noise off the residual of a fit if the bead makes most of the differences along the border: a bead that reaches the
+    /// border is no noise.
+    pub(super) fn explain_noise(&mut self, f: &Fitted) {
+        if let PixelNoise::Estimated = self.config.noise {
+            let (variance, freedom) = self.noise_left_by(f);
+            if variance < EXPLAINED * self.noise_here.0 {
+                self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
+                self.noise_variance = Some(self.noises.moderate(variance, self.noise_here.1));
+            }
+        }
+    }
+
+    /// Noise variance of a fit's residual along the border, and its degrees of freedom.
+    fn noise_left_by(&self, f: &Fitted) -> (f64, f64) {
+        let x = (f.x_px - self.crop.x0 as f64) as f32;
+        let y = (f.y_px - self.crop.y0 as f64) as f32;
+        let amplitude = f.pass.amplitude as f32;
+        self.crop.noise_variance(|j, i| {
+            let (dx, dy) = (i as f32 - x, j as f32 - y);
+            amplitude * self.template.value_at_squared(dx * dx + dy * dy)
+        })
     }
 
     /// Takes in the noise of the window at hand, whatever the verdict: a noise that is thought too large would never be corrected by fixes

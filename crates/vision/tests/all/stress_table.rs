@@ -367,6 +367,13 @@ fn the_error_in_pictures_of_a_codec_is_stated() {
 }
 
 #[test]
+fn a_ring_that_reaches_the_border_of_its_window_is_no_noise_there() {
+    let rows = [(4, Settings::Pasted), (5, Settings::Right)];
+    let rows = rows.map(|(kind, settings)| (kind, 200.0, settings, Spoil::Defocus(1.15)));
+    run_with(&rows, 60.0, &(0.7..1.4));
+}
+
+#[test]
 fn a_profile_is_learnt_from_the_beads_that_it_fits() {
     // Two beads in one region are as wide as one with its ring, and as many.
     let rows = [(8, 40.0, Settings::Suggested, Spoil::Neighbours)];
