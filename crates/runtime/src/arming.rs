@@ -13,11 +13,14 @@
 //! An object that does not move at all may be a bead on the glass. It is rejected, and the pulse tries another object. If no other comes,
 //! or none of several moves, the plant is refused.
 
+mod increments;
+
 use crate::life::Refusal;
 use cellpos_control::LoopModel;
-use cellpos_numeric::statistics::student_t_quantile;
+use cellpos_numeric::statistics::{Z95, student_t_quantile};
 use cellpos_numeric::units::Seconds;
 use cellpos_plant::{DiscretePlant, PlantError, TransferFunction};
+use increments::{Rest, Sums};
 use serde::{Deserialize, Serialize};
 
 /// How arming goes. In TOML every key may be left out.
@@ -62,8 +65,10 @@ impl Default for ArmingConfig {
 pub struct GainCheck {
     /// Measured gain over the model's.
     pub gain_ratio: f64,
-    /// Its standard deviation.
+    /// Its standard deviation, if the increments of the bead are independent.
     pub sd: f64,
+    /// The same with what shook the bead before the pulse: a hum of the pulse's period is part of its response.
+    pub shaken_sd: f64,
     /// Degrees of freedom from which that is known.
     pub dof: f64,
     /// Why the plant is refused, if it is.
@@ -78,6 +83,7 @@ impl GainCheck {
         Self {
             gain_ratio: f64::NAN,
             sd: f64::NAN,
+            shaken_sd: f64::NAN,
             dof: f64::NAN,
             refusal,
             sure: refusal != Some(Refusal::Disturbed),
@@ -90,6 +96,11 @@ impl GainCheck {
             return f64::NAN;
         }
         self.sd * student_t_quantile(0.975, self.dof)
+    }
+
+    /// The same for the gain that is stated.
+    pub fn stated95(&self) -> f64 {
+        self.ci95().max(Z95 * self.shaken_sd)
     }
 }
 
@@ -130,36 +141,13 @@ pub struct ArmingState {
     last: Option<(f64, f64)>,
     /// Ticks in a row without a frame.
     silent: u32,
-    /// Increments of all pulses.
+    /// Increments of the bead at rest before this pulse, and of all pulses.
+    rest: Rest,
     seen: Sums,
     /// Tick of the pulse at which a command last did not come into force when it was due.
     unled_at: Option<u32>,
     /// Whether time has not passed as planned in this pulse.
     disturbed: bool,
-}
-
-/// Sums for the fit of increments `y` by `drift * time + ratio * x`, each with a variance that grows with its time.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Sums {
-    count: f64,
-    ticks: f64,
-    x: f64,
-    y: f64,
-    xx: f64,
-    xy: f64,
-    yy: f64,
-}
-
-impl Sums {
-    fn add(&mut self, ticks: f64, x: f64, y: f64) {
-        self.count += 1.0;
-        self.ticks += ticks;
-        self.x += x;
-        self.y += y;
-        self.xx += x * x / ticks;
-        self.xy += x * y / ticks;
-        self.yy += y * y / ticks;
-    }
 }
 
 impl ArmingState {
@@ -304,10 +292,11 @@ impl Arming {
         };
         state.silent = if input.framed { 0 } else { state.silent + 1 };
         let Some(pulse) = state.pulse else {
-            if fix.is_some() {
+            if let Some(fix) = fix {
                 state.steady += 1;
+                self.rest(state, &fix);
             } else if input.framed || state.silent > self.most_silent {
-                state.steady = 0;
+                (state.steady, state.last, state.rest) = (0, None, Rest::default());
             }
             if state.steady >= self.config.steady_ticks {
                 if !self.config.check {
@@ -369,6 +358,21 @@ impl Arming {
         }
     }
 
+    /// A position before the pulse.
+    fn rest(&self, state: &mut ArmingState, fix: &Fix) {
+        let now = f64::from(state.ticks) - fix.late_ticks;
+        let last = state.last.replace((now, fix.position_um));
+        if let Some((from, before_um)) = last.filter(|(from, _)| *from < now) {
+            let up = f64::from(self.config.pulse_ticks);
+            let waves = [now, now + 0.5 * up].map(|at| {
+                let is_first = (at / up).rem_euclid(2.0) < 1.0;
+                if is_first { 1.0 } else { -1.0 }
+            });
+            let y = (fix.position_um - before_um) / (now - from).sqrt();
+            state.rest.add(waves, y);
+        }
+    }
+
     /// The position of a tick of the pulse.
     fn take(&self, state: &mut ArmingState, input: &ArmingInput, tick: u32) {
         let Some(fix) = input.fix else {
@@ -407,7 +411,7 @@ impl Arming {
 
     /// What the pulses tell, by the increments that nothing disturbed.
     fn judge(&self, state: &ArmingState) -> GainCheck {
-        self.fitted(&state.seen).unwrap_or_else(|| {
+        self.fitted(&state.seen, &state.rest).unwrap_or_else(|| {
             GainCheck::unmeasured(Some(if state.disturbed {
                 Refusal::Disturbed
             } else {
@@ -417,7 +421,7 @@ impl Arming {
     }
 
     /// Straight-line fit of increments; `None` if there are too few.
-    fn fitted(&self, s: &Sums) -> Option<GainCheck> {
+    fn fitted(&self, s: &Sums, rest: &Rest) -> Option<GainCheck> {
         // Half of a pulse must have been seen, or the ratio means nothing.
         if s.ticks < f64::from(self.least) || s.count < 3.0 {
             return None;
@@ -434,6 +438,7 @@ impl Arming {
         let mut found = GainCheck {
             gain_ratio,
             sd,
+            shaken_sd: sd.max((rest.variance() / sxx).sqrt()),
             dof,
             refusal: None,
             sure: true,

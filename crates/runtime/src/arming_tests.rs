@@ -1,6 +1,7 @@
 //! The arming pulse against plants that are right, wrong, lost and disturbed.
 
 use super::*;
+use std::f64::consts::TAU;
 
 const SAMPLE: Seconds = Seconds(1e-3);
 const DELAY: Seconds = Seconds(2e-3);
@@ -384,6 +385,7 @@ fn a_few_missing_frames_do_not_matter() {
 fn arm_in_brownian_motion(
     plant: &TransferFunction,
     model: &LoopModel,
+    hum_um: f64,
     seed: u32,
 ) -> (GainCheck, f64) {
     let sample = Seconds(model.sample_time_s);
@@ -403,12 +405,14 @@ fn arm_in_brownian_motion(
     };
     let step_um = (2.0 * 0.33 * sample.value()).sqrt();
     let (mut wander_um, mut command, mut farthest) = (0.0, 20.0, 0.0_f64);
+    let (turn, mut angle) = (TAU * 50.0 * sample.value(), TAU * uniform());
     loop {
+        angle += turn;
         let answer_um = plant.output_um(&truth);
         farthest = farthest.max(answer_um.abs());
         wander_um += step_um * (0..12).map(|_| uniform()).sum::<f64>();
         let input = ArmingInput {
-            fix: Some(due(answer_um + wander_um)),
+            fix: Some(due(answer_um + wander_um + hum_um * angle.sin())),
             framed: true,
             command_um: command,
             neutral_um: 20.0,
@@ -453,7 +457,7 @@ fn the_interval_of_the_gain_holds_behind_a_fast_and_a_slow_actuator() {
         const RUNS: u32 = 400;
         let (mut inside, mut squares, mut farthest) = (0, 0.0, 0.0_f64);
         for seed in 0..RUNS {
-            let (check, far_um) = arm_in_brownian_motion(&plant, &model, seed);
+            let (check, far_um) = arm_in_brownian_motion(&plant, &model, 0.0, seed);
             assert_eq!(check.refusal, None, "{name}: {check:?}");
             inside += u32::from((check.gain_ratio - 1.0).abs() < check.ci95());
             squares += (check.gain_ratio - 1.0).powi(2);
@@ -473,4 +477,21 @@ fn the_interval_of_the_gain_holds_behind_a_fast_and_a_slow_actuator() {
         );
         assert!(farthest < 4.5, "{name}: {farthest} um");
     }
+}
+
+/// The mains: a pulse of 20 ms is one period.
+#[test]
+fn a_hum_of_the_pulses_period_is_in_the_interval_that_is_stated() {
+    const RUNS: u32 = 400;
+    let (plant, model) = (TransferFunction::eq6(), LoopModel::eq6(2e-3));
+    let (mut alone, mut stated) = (0, 0);
+    for seed in 0..RUNS {
+        let (check, _) = arm_in_brownian_motion(&plant, &model, 0.3, seed);
+        let off = (check.gain_ratio - 1.0).abs();
+        alone += u32::from(off < check.ci95());
+        stated += u32::from(off < check.stated95());
+    }
+    let [alone, stated] = [alone, stated].map(|n| f64::from(n) / f64::from(RUNS));
+    println!("{alone:.3} by the increments of the pulse alone, {stated:.3} stated");
+    assert!(alone < 0.8 && stated > 0.92, "{alone} {stated}");
 }

@@ -142,7 +142,7 @@ impl<R: ReferenceGenerator> Core<R> {
             Step::Another(command_um, verdict) => {
                 tick.event(EventKind::ArmingRejected {
                     gain_ratio: verdict.gain_ratio,
-                    ci95: verdict.ci95(),
+                    ci95: verdict.stated95(),
                 });
                 return Some(Mode::Direct(command_um));
             }
@@ -151,7 +151,7 @@ impl<R: ReferenceGenerator> Core<R> {
                     tick.event(EventKind::ArmingRepeated {
                         refusal,
                         gain_ratio: verdict.gain_ratio,
-                        ci95: verdict.ci95(),
+                        ci95: verdict.stated95(),
                     });
                 }
                 return Some(Mode::Direct(command_um));
@@ -161,17 +161,20 @@ impl<R: ReferenceGenerator> Core<R> {
                     tick.event(EventKind::ArmingRefused {
                         refusal,
                         gain_ratio: verdict.gain_ratio,
-                        ci95: verdict.ci95(),
+                        ci95: verdict.stated95(),
                     });
                     self.latch(SafeReason::ArmingRefused, tick);
                 }
                 None => {
-                    self.controller
-                        .start_estimate(verdict.gain_ratio, verdict.sd, verdict.dof);
+                    self.controller.start_estimate(
+                        verdict.gain_ratio,
+                        verdict.shaken_sd,
+                        verdict.dof,
+                    );
                     if verdict.gain_ratio.is_finite() {
                         tick.event(EventKind::ArmingPassed {
                             gain_ratio: verdict.gain_ratio,
-                            ci95: verdict.ci95(),
+                            ci95: verdict.stated95(),
                         });
                     }
                     tick.event(EventKind::Running);
