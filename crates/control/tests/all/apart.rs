@@ -12,7 +12,7 @@ pub(crate) const FINE: usize = 20;
 pub(crate) const STEP_S: f64 = 1e-3 / FINE as f64;
 pub(crate) const NEUTRAL_UM: f64 = 20.0;
 pub(crate) const DELAY_MS: usize = 2;
-pub(crate) const EXPOSURE_STEPS: usize = 4;
+const EXPOSURE_STEPS: usize = 4;
 const NOISE_UM: f64 = 0.02;
 
 /// Eq. (6) in controllable form, by Heun's method, and what else moves the bead.
@@ -152,23 +152,28 @@ impl Row {
     }
 }
 
-/// Seconds of a stay.
-fn stay(row: &Row, seed: u64, seconds: usize, kept: &mut Kept) {
-    let base = config(ControllerConfig::Lqg(Lqg::default()));
-    let rate = row.rate;
-    let config = LoopConfig {
+/// A loop for this world, with `rate` ticks in a millisecond.
+pub(crate) fn loop_of(law: ControllerConfig, adapt: bool, rate: usize) -> LoopConfig {
+    let base = config(law);
+    LoopConfig {
         model: LoopModel {
             sample_time_s: 1e-3 / rate as f64,
             ..LoopModel::eq6(DELAY_MS as f64 * 1e-3)
         },
         estimator: EstimatorConfig {
-            adapt: true,
+            adapt,
             exposure_ms: EXPOSURE_STEPS as f64 / FINE as f64,
             ..base.estimator
         },
         ..base
-    };
-    let mut controller = Controller::new(config).unwrap();
+    }
+}
+
+/// Seconds of a stay.
+fn stay(row: &Row, seed: u64, seconds: usize, kept: &mut Kept) {
+    let rate = row.rate;
+    let law = ControllerConfig::Lqg(Lqg::default());
+    let mut controller = Controller::new(loop_of(law, true, rate)).unwrap();
     controller.start(NEUTRAL_UM, NEUTRAL_UM);
     let mut world = World::new(seed, row.flow);
     world.gain = row.gain[0];

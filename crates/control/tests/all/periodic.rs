@@ -1,7 +1,7 @@
 //! A periodic flow (a pump, the mains, a fan) is detected, becomes part of the model, and is cancelled by the command.
 
-use crate::apart::{self, DELAY_MS, EXPOSURE_STEPS, FINE, NEUTRAL_UM, STEP_S, World};
-use crate::common::{config, mpc};
+use crate::apart::{self, DELAY_MS, FINE, NEUTRAL_UM, STEP_S, World, loop_of};
+use crate::common::mpc;
 use cellpos_control::design::bound_rms_um;
 use cellpos_control::*;
 use std::f64::consts::TAU;
@@ -18,20 +18,7 @@ struct Held {
 
 impl Held {
     fn new(controller: ControllerConfig, adapt: bool, rate: usize, seed: u64) -> Self {
-        let base = config(controller);
-        let config = LoopConfig {
-            model: LoopModel {
-                sample_time_s: 1e-3 / rate as f64,
-                ..LoopModel::eq6(DELAY_MS as f64 * 1e-3)
-            },
-            estimator: EstimatorConfig {
-                adapt,
-                exposure_ms: EXPOSURE_STEPS as f64 / FINE as f64,
-                ..base.estimator
-            },
-            ..base
-        };
-        let mut controller = Controller::new(config).unwrap();
+        let mut controller = Controller::new(loop_of(controller, adapt, rate)).unwrap();
         controller.start(NEUTRAL_UM, NEUTRAL_UM);
         Self {
             preview: vec![0.0; controller.preview_len()],

@@ -1,7 +1,7 @@
 //! A line in the flow, under ticks that are uneven and slip against the camera.
 
-use crate::apart::{DELAY_MS, EXPOSURE_STEPS, FINE, Flow, NEUTRAL_UM, World};
-use crate::common::{config, first_seed};
+use crate::apart::{FINE, Flow, NEUTRAL_UM, World, loop_of};
+use crate::common::first_seed;
 use cellpos_control::*;
 use cellpos_numeric::Random;
 
@@ -18,17 +18,8 @@ struct Ticks {
 
 /// RMS of the bead's position, nm, from 10 s on, while a line of 100 Hz with this amplitude, um, shakes it.
 fn held_nm(line_um: f64, ticks: Ticks, seed: u64) -> f64 {
-    let base = config(ControllerConfig::Lqg(Lqg::default()));
-    let config = LoopConfig {
-        model: LoopModel::eq6(DELAY_MS as f64 * 1e-3),
-        estimator: EstimatorConfig {
-            adapt: true,
-            exposure_ms: EXPOSURE_STEPS as f64 / FINE as f64,
-            ..base.estimator
-        },
-        ..base
-    };
-    let mut controller = Controller::new(config).unwrap();
+    let law = ControllerConfig::Lqg(Lqg::default());
+    let mut controller = Controller::new(loop_of(law, true, 1)).unwrap();
     controller.start(NEUTRAL_UM, NEUTRAL_UM);
     let mut world = World::new(seed, Flow::Lines(100.0, line_um, 1));
     let preview = vec![0.0; controller.preview_len()];
