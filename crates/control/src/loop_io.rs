@@ -70,7 +70,7 @@ pub struct LoopInput<'a> {
     pub in_force: Option<InForce>,
     /// Known shift of the zero flow in this tick, such as by a second actuator, um of PZT. Estimator, law and command shift with it.
     pub zero_flow_shift_um: f64,
-    /// Time by which this tick, and its command with it, comes later than the ticks before it say, samples: what is uneven of them.
+    /// Unevenness of the ticks: time by which this one, and its command, comes later than the ticks before it say, samples.
     pub late_samples: f64,
     /// How long an optimising controller may take.
     pub solver: SolverTerms,

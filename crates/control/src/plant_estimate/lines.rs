@@ -123,8 +123,8 @@ impl Line {
         product(self.amplitude, product(self.phase, unit(self.turn * ticks)))
     }
 
-    /// Jump at a tick of a motion against it, over where that motion ends the tick before: `D (u_k - u_(k-1))` where a command moves the bead
-    /// by `m u_k + D (u_k - u_(k-1))` in a tick, and `jump` is `D/m`.
+    /// Jump at a tick of a motion against it, as a factor of where that motion ended the tick before. A command moves the bead by
+    /// `m u_k + D (u_k - u_(k-1))` in a tick, its second part at once; `jump` is `D/m`.
     fn jump(&self, jump: f64) -> [f64; 2] {
         let [cos, sin] = unit(self.turn);
         let over = [1.0 + jump * (1.0 - cos), jump * sin];
@@ -133,21 +133,21 @@ impl Line {
 
     /// Where a motion against it is to be at a tick some ticks from now, um.
     ///
-    /// The command is held, so the motion jumps at a tick and is straight until the next one. Of a motion whose ends turn by `w` in a tick,
-    /// this part is left at the line's frequency, and the ends are as much beyond the line:
-    /// `sinc(w/2)^2 + jump int_0^1 (1 - x) exp(-i w x) dx`.
-    fn end(&self, ticks: f64, jump: f64) -> [f64; 2] {
+    /// The command is held, so the motion jumps at a tick and is straight until the next one. Its ends turn by `w` in a tick. This part of
+    /// them is left at the line's frequency, and so they are beyond the line: `sinc(w/2)^2 + jump int_0^1 (1 - x) exp(-i w x) dx`.
+    fn end(&self, ticks: f64, jump: [f64; 2]) -> [f64; 2] {
         let (w, [cos, sin]) = (self.turn, unit(self.turn));
         let straight = (2.0 - 2.0 * cos) / (w * w);
-        let jumps = product(self.jump(jump), [0.5 * straight, (sin / w - 1.0) / w]);
+        let jumps = product(jump, [0.5 * straight, (sin / w - 1.0) / w]);
         quotient(self.at(ticks), [straight + jumps[0], jumps[1]])
     }
 
-    /// What the motion against it leaves of it between two ticks, some ticks ago, um.
+    /// The rest of the line that the motion against it leaves between two ticks, some ticks ago, um.
     fn left_um(&self, ago: f64, jump: f64) -> f64 {
         let newer = ago.floor();
         let (since, [cos, sin]) = (1.0 - (ago - newer), unit(self.turn));
-        let jumped = self.jump(jump).map(|part| (1.0 - since) * part);
+        let jump = self.jump(jump);
+        let jumped = jump.map(|part| (1.0 - since) * part);
         let way = [
             1.0 - since + jumped[0] + since * cos,
             jumped[1] + since * sin,
@@ -179,7 +179,7 @@ impl Lines {
     pub(super) fn end_um(&self, settings: &LineSettings, ticks: f64) -> f64 {
         let confirmed = self.now().iter().filter(|line| line.confirmed);
         confirmed
-            .map(|line| line.end(ticks, settings.jump)[0])
+            .map(|line| line.end(ticks, line.jump(settings.jump))[0])
             .sum()
     }
 

@@ -91,7 +91,7 @@ fn the_motion_against_a_line_has_the_lines_amplitude_at_its_frequency() {
                 turn,
                 ..Line::default()
             };
-            let end_um = |k: usize| line.end(k as f64, jump)[0];
+            let end_um = |k: usize| line.end(k as f64, line.jump(jump))[0];
             let mut before_um = end_um(1) - end_um(0);
             let (mut sum, mut farthest) = ([0.0; 2], 0.0_f64);
             for k in 1..TICKS {

@@ -5,9 +5,8 @@ use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::problem::Mask;
 use crate::search::cost::threshold_of_waves;
+use cellpos_numeric::fft::{self, Complex};
 use cellpos_plant::effects::{FitParameter, Role};
-use realfft::RealFftPlanner;
-use realfft::num_complex::Complex;
 use std::f64::consts::TAU;
 use std::ops::Range;
 
@@ -110,7 +109,7 @@ impl Spectra {
         let bins = (4 * rows).next_power_of_two();
         let step_hz = 1.0 / (bins as f64 * ctx.problem.base.sample_s);
         let kept = (bins / 2 + 1).min((highest_hz / step_hz) as usize + 2);
-        let plan = RealFftPlanner::<f64>::new().plan_fft_forward(bins);
+        let plan = fft::plan(bins);
         let (mut counted, mut transform) = (plan.make_input_vec(), plan.make_output_vec());
         let mut spectrum = |e: &[f64], ranges: &[Range<usize>], part: Range<usize>| {
             counted.fill(0.0);

@@ -8,7 +8,7 @@ use crate::fit::context::{Context, Fit};
 use crate::problem::{Mask, Prepared};
 use crate::search::cost::threshold_of_waves;
 use crate::search::suspect::{Suspect, pair_score};
-use realfft::RealFftPlanner;
+use cellpos_numeric::fft;
 use std::f64::consts::TAU;
 
 /// Width of a bin of positions \[um\]: a fifth of the smallest pixel.
@@ -54,9 +54,7 @@ pub(crate) fn pixel_scan(
     }
     let mut density = density(ctx, fit, &positions, (low, span), mask);
     let bins = density.len();
-    let plan = RealFftPlanner::<f64>::new().plan_fft_forward(bins);
-    let mut transform = plan.make_output_vec();
-    plan.process(&mut density, &mut transform).ok()?;
+    let transform = fft::forward(&mut density);
     let step = 1.0 / (bins as f64 * BIN_UM);
     let columns = |q: f64| columns(ctx, fit, &positions, q, mask);
     // Energy of a unit sine after the filter, smooth in the wave number.

@@ -3,7 +3,6 @@
 use crate::fit::context::{Context, Fit};
 use crate::thresholds::CHANCE_SD;
 use crate::verdict::response::{self, BandRatio, transform};
-use realfft::RealFftPlanner;
 
 /// Lower edges of the bands \[Hz\]. The last band of a record ends at half its rate, so the bands together hold all of its energy.
 const BAND_STARTS_HZ: [f64; 10] = [
@@ -84,10 +83,9 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     let edges_hz = band_edges_hz(sample_s);
     let bands = edges_hz.len() - 1;
     let limit = CHANCE_SD;
-    let mut planner = RealFftPlanner::<f64>::new();
     let mut rows = Vec::new();
     for (r, e) in ctx.problem.records.iter().zip(&fit.innovations) {
-        let spectrum = transform(&mut planner, e);
+        let spectrum = transform(e);
         let n = e.len();
         let share = r.whitener.count() as f64 / n as f64;
         let mut energy = vec![0.0; bands];
@@ -135,6 +133,6 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     DiscrepancyMap {
         edges_hz,
         rows,
-        ratios: response::ratios(ctx, fit, &mut planner),
+        ratios: response::ratios(ctx, fit),
     }
 }

@@ -9,9 +9,8 @@
 
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
+use cellpos_numeric::fft::{self, Complex};
 use nalgebra::{DMatrix, DVector};
-use realfft::RealFftPlanner;
-use realfft::num_complex::Complex;
 
 /// Ratio of the measured to the simulated motion in a band.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
@@ -102,15 +101,8 @@ fn driven(simulated: &[f64], innovations: &[f64]) -> Vec<f64> {
 }
 
 /// Spectrum of a series, from 0 Hz on.
-pub(super) fn transform(planner: &mut RealFftPlanner<f64>, x: &[f64]) -> Vec<Complex<f64>> {
-    let plan = planner.plan_fft_forward(x.len());
-    let mut input = x.to_vec();
-    let mut output = plan.make_output_vec();
-    // Lengths come from the plan itself, so that this cannot fail; an empty answer would only leave the map blank.
-    if plan.process(&mut input, &mut output).is_err() {
-        output.fill(Complex::new(0.0, 0.0));
-    }
-    output
+pub(super) fn transform(x: &[f64]) -> Vec<Complex<f64>> {
+    fft::forward(&mut x.to_vec())
 }
 
 /// Sums of a band.
@@ -158,18 +150,17 @@ fn add(
     centres: &[f64],
     sample_s: f64,
     [instrument, simulated, innovations]: [&[f64]; 3],
-    planner: &mut RealFftPlanner<f64>,
 ) {
     let n = simulated.len();
     // A sine of micrometres would leak into its neighbours far above the noise, and pass for their excitation.
-    let mut windowed = |x: &[f64]| {
+    let windowed = |x: &[f64]| {
         let hann = |k: usize| 1.0 - (std::f64::consts::TAU * k as f64 / n as f64).cos();
-        let x: Vec<f64> = x
+        let mut x: Vec<f64> = x
             .iter()
             .enumerate()
             .map(|(k, x)| x * hann(k) * (2.0f64 / 3.0).sqrt())
             .collect();
-        transform(planner, &x)
+        fft::forward(&mut x)
     };
     let (z, s, e) = (
         windowed(instrument),
@@ -190,11 +181,7 @@ fn add(
 }
 
 /// Complex ratio of measured to simulated, on whitened series, in bands a third of an octave wide, all records together.
-pub(super) fn ratios(
-    ctx: &Context<'_>,
-    fit: &Fit,
-    planner: &mut RealFftPlanner<f64>,
-) -> Vec<BandRatio> {
+pub(super) fn ratios(ctx: &Context<'_>, fit: &Fit) -> Vec<BandRatio> {
     let sample_s = ctx.problem.base.sample_s;
     let sim = ctx.simulated(&fit.parts, fit.offset_um, &ctx.problem.all());
     let centres = centres(sample_s);
@@ -205,13 +192,7 @@ pub(super) fn ratios(
         }
         let s = r.whitened(&sim[i]);
         let e = &fit.innovations[i];
-        add(
-            &mut bands,
-            &centres,
-            sample_s,
-            [&driven(&s, e), &s, e],
-            planner,
-        );
+        add(&mut bands, &centres, sample_s, [&driven(&s, e), &s, e]);
     }
     let of = |(band, hz): (&Band, &f64)| band.ratio(*hz);
     bands.iter().zip(&centres).filter_map(of).collect()
@@ -255,8 +236,7 @@ mod tests {
     fn bands(instrument: &[f64], s: &[f64], e: &[f64]) -> Vec<BandRatio> {
         let centres = centres(1e-3);
         let mut bands = vec![Band::default(); centres.len()];
-        let mut planner = RealFftPlanner::new();
-        add(&mut bands, &centres, 1e-3, [instrument, s, e], &mut planner);
+        add(&mut bands, &centres, 1e-3, [instrument, s, e]);
         let of = |(band, hz): (&Band, &f64)| band.ratio(*hz);
         bands.iter().zip(&centres).filter_map(of).collect()
     }
