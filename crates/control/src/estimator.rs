@@ -74,6 +74,8 @@ pub struct EstimatorState {
     pub spread_um2: f64,
     /// Part of the stated uncertainty of the gain that is left; 1 where nothing more is known of it.
     pub gain_doubt: f64,
+    /// By how much the square of the walk of the zero flow is above that of the configuration, um^2/s; 0 where nothing more is known of it.
+    pub beyond_walk_um2_per_s: f64,
     /// Ticks by which the filter's time lies behind the nominal delay.
     pub lag: u8,
     /// Refused measurements in a row.
@@ -201,6 +203,7 @@ impl Estimator {
             still: StillBead::default(),
             spread_um2: 0.0,
             gain_doubt: 1.0,
+            beyond_walk_um2_per_s: 0.0,
             lag: 0,
             gated: 0,
             ticks_since_fix: 0,
@@ -259,13 +262,14 @@ impl Estimator {
         let m = self.filter_state(state);
         let motion = self.tick.gain * (command - m.n);
         let ts = self.model.sample_time_s;
-        let neutral_walk_um2 = self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts;
-        let usual_um2 = ZERO_FLOW_WALK_UM_PER_SQRT_S.powi(2) * ts;
+        let beyond_um2 = state.beyond_walk_um2_per_s * ts;
+        let neutral_walk_um2 = self.config.neutral_walk_um_per_sqrt_s.powi(2) * ts + beyond_um2;
+        let stated_walk_um2 = ZERO_FLOW_WALK_UM_PER_SQRT_S.powi(2) * ts + beyond_um2;
         state.lag = state.lag.saturating_sub(1);
         if state.stuck {
             state.modes = [0.0; MODES];
             state.covariance_um2 = at_rest(state.covariance_um2, neutral_walk_um2);
-            state.stated_um2 = at_rest(state.stated_um2, usual_um2);
+            state.stated_um2 = at_rest(state.stated_um2, stated_walk_um2);
             return motion;
         }
         let next = self.tick.advance(&m, command);
@@ -280,7 +284,7 @@ impl Estimator {
         state.spread_um2 = if crest > LEAST_SPREAD_UM2 { crest } else { 0.0 };
         let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * ts + state.spread_um2;
         state.covariance_um2 = advanced(state.covariance_um2, g, walk_um2, neutral_walk_um2);
-        state.stated_um2 = advanced(state.stated_um2, g, walk_um2, usual_um2);
+        state.stated_um2 = advanced(state.stated_um2, g, walk_um2, stated_walk_um2);
         motion
     }
 

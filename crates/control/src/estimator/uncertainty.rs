@@ -49,7 +49,8 @@ impl Estimator {
         }
         let (g, ts) = (self.tick.gain, self.model.sample_time_s);
         let walk_um2 = 2.0 * self.config.diffusion_um2_per_s * ts + state.spread_um2;
-        let flow_um2 = ZERO_FLOW_WALK_UM_PER_SQRT_S.powi(2) * ts;
+        let walk_um2_per_s = ZERO_FLOW_WALK_UM_PER_SQRT_S.powi(2) + state.beyond_walk_um2_per_s;
+        let flow_um2 = walk_um2_per_s * ts;
         for _ in 0..back {
             stated_um2 = advanced(stated_um2, g, walk_um2, flow_um2);
         }

@@ -8,7 +8,7 @@ use super::{AdaptState, Adapter, age_ticks};
 use crate::estimator::Fix;
 
 /// Standard deviations from which on less is taken of a fix (Huber).
-const FAR: f64 = 3.0;
+pub(super) const FAR: f64 = 3.0;
 /// Memory of the motion of the loop's own commands and of what they leave, fixes: three periods of the ringing that a gain that doubled
 /// makes.
 const NOW_FIXES: f64 = 60.0;
@@ -104,6 +104,7 @@ impl Adapter {
             state.cancelled_seen = Whitener::begin(cancelled_um);
             state.model.begin(at_um);
             state.instrument.begin(chosen_um);
+            self.zero_flow.begin(&mut state.zero_flow);
             return false;
         };
         let cancelled = correction.innovation(&state.cancelled_seen, cancelled_um);
@@ -114,10 +115,15 @@ impl Adapter {
         state.instrument.follow(&correction, &x);
         state.covariance = correction.after;
         let scale = correction.weight;
-        let (y, p, x) = (scale * y, p.map(|v| scale * v), x.map(|v| scale * v));
         let gain = state.force.log_gain.exp();
         let in_force = dot(&p, &frame.of(late));
-        state.now.add(y, in_force);
+        let disturbed = y - gain * in_force;
+        // The error of the model along a reference is no disturbance.
+        let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
+        let tells = (scale * chosen_um).powi(2) < usual_um2;
+        (self.zero_flow).learn(&mut state.zero_flow, &correction, disturbed, &fix, tells);
+        let (y, p, x) = (scale * y, p.map(|v| scale * v), x.map(|v| scale * v));
+        state.now.add(y, scale * in_force);
         let rise = (state.now.rise(gain, usual_um2)).min(MOST_CAUTION - state.force.log_gain);
         if rise > 0.0 {
             state.force.go(rise);
@@ -134,11 +140,9 @@ impl Adapter {
         let believed_weights = frame.of(believed.1);
         let moved = |p: &[f64; MEMBERS]| believed.0 * dot(p, &believed_weights);
         let far = (y - moved(&p)).abs() / (FAR * usual_um2.sqrt());
-        // The error of the model along a reference is not a line.
-        let chosen_um = x.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
-        if chosen_um * chosen_um < usual_um2 {
+        if tells {
             // What is cancelled shakes the plant all the same.
-            let disturbed_um = (y - gain * in_force) / gain - scale * cancelled;
+            let disturbed_um = scale * (disturbed / gain - cancelled);
             let fix = (disturbed_um, usual_um2 / (gain * gain));
             (state.lines).learn(&self.lines, &self.whitener, fix, shown_ago);
         }

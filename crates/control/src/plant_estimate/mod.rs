@@ -19,10 +19,11 @@ mod lines;
 mod motion;
 mod retuning;
 mod whiten;
+mod zero_flow;
 
 use crate::design::bound_rms_um;
 use crate::error::BuildError;
-use crate::estimator::{Estimator, EstimatorConfig, Fix, PredictedState};
+use crate::estimator::{Estimator, EstimatorConfig, EstimatorState, Fix, PredictedState};
 use crate::exposure::mean;
 use crate::feedforward::{FeedForward, FeedForwardState};
 use crate::loop_model::LoopModel;
@@ -36,6 +37,7 @@ pub use retuning::{AdaptMode, AdaptNews};
 use retuning::{DELAYS, INTERVAL, NOMINAL, REPORTED_GAIN, Retuning, TUNINGS};
 use serde::Serialize;
 use whiten::{Covariance, Track, Whitener};
+use zero_flow::{ZeroFlow, ZeroFlowState};
 
 /// Names of the columns that adaptation adds to a law's own in the record.
 pub const ADAPT_COLUMNS: [&str; 6] = [
@@ -79,6 +81,7 @@ pub(crate) struct Adapter {
     estimators: [Option<Estimator>; TUNINGS],
     nominal: Estimator,
     whitener: Whitener,
+    zero_flow: ZeroFlow,
     /// Whole and fractional samples of the design's delay.
     delay_samples: f64,
     /// Time in which the speed moves the bead as far as the jump does, ticks.
@@ -114,6 +117,7 @@ pub struct AdaptState {
     silent: u32,
     evidence: Evidence,
     colour: Colour,
+    zero_flow: ZeroFlowState,
     now: learn::Now,
     lines: Lines,
     /// Time by which this tick came later than the ticks before it say, ticks. Lines go on evenly, and so does a camera; a tick does not.
@@ -166,7 +170,9 @@ impl Adapter {
         let move_ticks = dither::move_ticks(ts);
         let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
         let drift_um2 =
-            (config.neutral_walk_um_per_sqrt_s.max(0.01) * model.gain_per_s * ts).powi(2) * ts;
+            (config.neutral_walk_um_per_sqrt_s.max(zero_flow::LEAST) * model.gain_per_s * ts)
+                .powi(2)
+                * ts;
         let fix_um2 = config.fix_noise_um.powi(2);
         let hold_um = bound_rms_um(config.diffusion_um2_per_s, 0.0, model.delay_s, ts);
         // Where a lag keeps the plant from moving at once it still gets there, and where it moves at once it may not stay.
@@ -180,6 +186,7 @@ impl Adapter {
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
             whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
+            zero_flow: ZeroFlow::new(&config, &model)?,
             lines: LineSettings::new(ts, config.ticks_per_fix, jump),
             forward: FeedForward::new(&model)?,
             delay_samples: model.delay_samples(),
@@ -204,6 +211,7 @@ impl Adapter {
             silent: 0,
             evidence: Evidence::new(-self.delay_samples, self.whitener.noise_um2),
             colour: Colour::new(self.whitener.noise_um2),
+            zero_flow: self.zero_flow.start(),
             now: learn::Now::default(),
             lines: Lines::new(),
             late: 0.0,
@@ -239,9 +247,15 @@ impl Adapter {
         }
     }
 
+    /// Tells the estimator what it does not learn itself: how well the gain is known, as a part of `stated`, and how fast the zero flow walks.
+    pub(crate) fn tell(&self, state: &AdaptState, stated: f64, estimator: &mut EstimatorState) {
+        estimator.gain_doubt = self.gain_doubt(state, stated);
+        estimator.beyond_walk_um2_per_s = state.zero_flow.beyond_um2_per_s;
+    }
+
     /// Uncertainty of the gain in force as a part of `stated`: two standard deviations of the estimate, plus its distance from the gain in
     /// force. 1 before the gain was measured.
-    pub(crate) fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
+    fn gain_doubt(&self, state: &AdaptState, stated: f64) -> f64 {
         let sure = state.force.mode != AdaptMode::Learning;
         let Some(found) = state
             .evidence

@@ -17,6 +17,7 @@ mod solvers;
 mod state_feedback;
 mod stuck_bead;
 mod uneven;
+mod wandering_flow;
 
 /// Counts by thread, so that tests beside each other do not disturb one another.
 #[global_allocator]
