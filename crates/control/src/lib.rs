@@ -86,7 +86,9 @@ pub use partner::{
 };
 pub use path::PathState;
 pub use pi::{Lead, Pi, PiLaw, PiState};
-pub use plant_estimate::{ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation};
+pub use plant_estimate::{
+    ADAPT_COLUMNS, AdaptMode, AdaptNews, AdaptState, Adaptation, PeriodicFlow,
+};
 pub use reference::{Points, Profile, Reference, Shape, fill_preview};
 pub use simulation::{RigConfig, SimulatedRig};
 pub use toml_file::ConfigError;

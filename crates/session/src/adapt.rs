@@ -35,10 +35,18 @@ pub fn text(now: &Adaptation) -> String {
             cellpos_numeric::statistics::Z95 * sd
         )
     });
-    format!(
+    let mut text = format!(
         "tuned to {:.2} of the model's gain{found}, {:+.1} samples of delay; {mode}",
         now.gain, now.delay_samples
-    )
+    );
+    for flow in now.periodic_flows.iter().flatten() {
+        let (hz, um) = (flow.frequency_hz, flow.amplitude_um);
+        text += &format!("; a flow of {hz:.2} Hz is cancelled ({um:.2} um)");
+    }
+    if let Some(walk) = now.zero_flow_walk_um_per_sqrt_s {
+        text += &format!("; zero flow wanders by {walk:.2} um in a second");
+    }
+    text
 }
 
 /// State of adaptation in a tick, from its columns in the record; `None` if they are empty.
@@ -60,7 +68,8 @@ pub(crate) fn recorded(columns: &[f32]) -> Option<Adaptation> {
         gain_estimate: known.then_some([f64::from(found), f64::from(sd)]),
         delay_estimate_samples: None,
         mode,
-        lines: 0,
+        periodic_flows: Default::default(),
+        zero_flow_walk_um_per_sqrt_s: None,
         news: None,
     })
 }
@@ -112,6 +121,7 @@ pub(crate) fn sentence(kind: &EventKind) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cellpos_control::PeriodicFlow;
 
     fn told(gain: [f64; 2], delay_ms: f64, over_s: f64) -> String {
         told_from(gain, [0.0, delay_ms], over_s)
@@ -138,6 +148,15 @@ mod tests {
         assert!(text(&limit).ends_with("; at the end of its range"));
         let unknown = recorded(&[1.0, 0.0, f32::NAN, f32::NAN, 0.0]).expect("too little motion");
         assert!(!text(&unknown).contains("estimated"));
+        let mut shaken = unknown;
+        shaken.periodic_flows[0] = Some(PeriodicFlow {
+            frequency_hz: 50.0,
+            amplitude_um: 0.3,
+        });
+        shaken.zero_flow_walk_um_per_sqrt_s = Some(0.2);
+        assert!(text(&shaken).ends_with(
+            "learning; a flow of 50.00 Hz is cancelled (0.30 um); zero flow wanders by 0.20 um in a second"
+        ));
         assert_eq!(recorded(&[f32::NAN; 6]), None);
         assert_eq!(recorded(&[1.0]), None);
     }

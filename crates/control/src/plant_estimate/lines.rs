@@ -16,9 +16,10 @@ mod search;
 
 use super::whiten::Whitener;
 use search::{BINS, CANDIDATE_S, Search, SearchSettings, square, unit};
+use std::f64::consts::TAU;
 
 /// Lines at once: a pump with five harmonics, the mains, and one more.
-const MOST: usize = 8;
+pub(super) const MOST: usize = 8;
 /// Bins within which two lines are one: less than half a main lobe.
 const ONE_LINE: f64 = 1.5;
 /// Mean time between two false positives, s: 28 hours.
@@ -166,9 +167,14 @@ impl Lines {
         }
     }
 
-    /// How many are confirmed.
-    pub(super) fn count(&self) -> usize {
-        self.now().iter().filter(|line| line.confirmed).count()
+    /// Those that the command cancels, by their frequency, Hz, and amplitude, um over the gain in force.
+    pub(super) fn cancelled(&self, settings: &LineSettings) -> [Option<[f64; 2]>; MOST] {
+        let mut confirmed = self.now().iter().filter(|line| line.confirmed);
+        let hz = |line: &Line| line.turn / (TAU * settings.sample_s);
+        std::array::from_fn(|_| {
+            let line = confirmed.next()?;
+            Some([hz(line), square(line.amplitude).sqrt()])
+        })
     }
 
     fn now(&self) -> &[Line] {

@@ -54,6 +54,22 @@ pub const ADAPT_COLUMNS: [&str; 6] = [
 const LOUDEST: f64 = 2.0;
 const KNOWN: f64 = 0.5 * REPORTED_GAIN / INTERVAL;
 
+/// A flow that moves the bead to and fro at one frequency.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PeriodicFlow {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Amplitude of the motion of a bead that nothing holds, um.
+    pub amplitude_um: f64,
+}
+
+fn those_that_are<S: serde::Serializer>(
+    flows: &[Option<PeriodicFlow>],
+    to: S,
+) -> Result<S::Ok, S::Error> {
+    to.collect_seq(flows.iter().flatten())
+}
+
 /// Where adaptation stands.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Adaptation {
@@ -67,9 +83,11 @@ pub struct Adaptation {
     pub delay_estimate_samples: Option<[f64; 2]>,
     /// Where the tuning stands.
     pub mode: AdaptMode,
-    /// Periodic disturbances that the command cancels.
-    #[serde(skip)]
-    pub lines: usize,
+    /// Periodic flows that the command cancels.
+    #[serde(serialize_with = "those_that_are")]
+    pub periodic_flows: [Option<PeriodicFlow>; lines::MOST],
+    /// Walk of the zero flow, um/sqrt(s); `None` while it is less than twice what the design assumes.
+    pub zero_flow_walk_um_per_sqrt_s: Option<f64>,
     /// A change that this tick reports.
     #[serde(skip)]
     pub news: Option<AdaptNews>,
@@ -328,13 +346,21 @@ impl Adapter {
     /// Where it stands.
     pub(crate) fn adaptation(&self, state: &AdaptState) -> Adaptation {
         let found = state.evidence.found;
+        let gain = state.force.log_gain.exp();
         Adaptation {
-            gain: state.force.log_gain.exp(),
+            gain,
             delay_samples: DELAYS[state.force.member],
             gain_estimate: found.map(|f| [f.gain, f.gain_sd]),
             delay_estimate_samples: found.map(|f| [f.delay, f.delay_sd]),
             mode: state.force.mode,
-            lines: state.lines.count(),
+            periodic_flows: (state.lines.cancelled(&self.lines)).map(|line| {
+                line.map(|[frequency_hz, amplitude_um]| PeriodicFlow {
+                    frequency_hz,
+                    amplitude_um: gain * amplitude_um,
+                })
+            }),
+            zero_flow_walk_um_per_sqrt_s: (self.zero_flow.faster(&state.zero_flow))
+                .map(|walk| walk / gain),
             news: state.news.map(|news| news.in_ticks(self.interval)),
         }
     }

@@ -129,6 +129,13 @@ impl ZeroFlow {
         }
     }
 
+    /// The walk, um/sqrt(s), if it is at least twice the design's.
+    pub(super) fn faster(&self, state: &ZeroFlowState) -> Option<f64> {
+        let [design, ..] = self.walks_um2_per_s;
+        let walk_um2_per_s = design + state.beyond_um2_per_s;
+        (walk_um2_per_s >= 4.0 * design).then(|| walk_um2_per_s.sqrt())
+    }
+
     /// By how much the square of the likeliest walk is above the design's, um^2/s: the mean of the walks on a logarithmic scale.
     fn beyond_um2_per_s(&self, state: &ZeroFlowState) -> f64 {
         let least = state
@@ -143,5 +150,68 @@ impl ZeroFlow {
             all += likelihood;
         }
         ((sum / all).exp() - self.walks_um2_per_s[0]).max(0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::controller::ControllerConfig;
+    use crate::design::{DesignPlant, margins};
+    use crate::lqg::Lqg;
+    use cellpos_numeric::Random;
+
+    #[test]
+    fn a_walk_is_found_within_a_factor_of_two_and_the_design_s_is_no_other() {
+        let (config, model) = (EstimatorConfig::default(), LoopModel::eq6(2e-3));
+        let zero_flow = ZeroFlow::new(&config, &model).unwrap();
+        let ts = model.sample_time_s;
+        let [least, .., most] = zero_flow.walks_um2_per_s;
+        let fix_um2 = config.fix_noise_um.powi(2);
+        for walk_um2_per_s in [0.0, least, 16.0 * least, 0.5 * most] {
+            let mut random = Random::new(7);
+            let mut state = zero_flow.start();
+            let filter = zero_flow.filters[0];
+            let (mut at, mut drift, mut seen) = (0.0, 0.0, Track::default());
+            for _ in 0..6_000 {
+                drift += (walk_um2_per_s * ts).sqrt() * model.gain_per_s * ts * random.normal();
+                at += drift + (2.0 * config.diffusion_um2_per_s * ts).sqrt() * random.normal();
+                let fix = Fix {
+                    position_um: at + config.fix_noise_um * random.normal(),
+                    variance_um2: fix_um2,
+                    age: 0,
+                    offset: 0.0,
+                };
+                let correction = filter.correction(filter.settled(), 1.0, fix_um2, 0.0);
+                let innovation = correction.innovation(&seen, fix.position_um);
+                correction.step(&mut seen, innovation);
+                zero_flow.learn(&mut state, &correction, innovation, &fix, true);
+            }
+            let found = least + state.beyond_um2_per_s;
+            let factor = (found / walk_um2_per_s.max(least)).sqrt();
+            assert!((0.5..2.0).contains(&factor), "{walk_um2_per_s}: {found}");
+        }
+    }
+
+    #[test]
+    fn the_fastest_filter_leaves_the_loop_its_margins() {
+        for fix_noise_um in [0.0006, 0.02, 0.06] {
+            let model = LoopModel::eq6(2e-3);
+            let config = EstimatorConfig {
+                fix_noise_um,
+                ..EstimatorConfig::default()
+            };
+            let zero_flow = ZeroFlow::new(&config, &model).unwrap();
+            let [.., most] = zero_flow.walks_um2_per_s;
+            let config = EstimatorConfig {
+                neutral_walk_um_per_sqrt_s: most.sqrt(),
+                ..config
+            };
+            let law = ControllerConfig::Lqg(Lqg::default())
+                .linear(&config, &model)
+                .unwrap();
+            let margins = margins(&DesignPlant::eq6(2.5e-3), &law).unwrap();
+            assert!(margins.stable && margins.ms < 2.0, "{margins:?}");
+        }
     }
 }

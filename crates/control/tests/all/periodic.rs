@@ -46,7 +46,10 @@ impl Held {
         }
         let now = self.controller.adaptation();
         self.told += usize::from(now.is_some_and(|now| now.news.is_some()));
-        (now.map_or(0, |now| now.lines), squares)
+        (
+            now.map_or(0, |now| now.periodic_flows.iter().flatten().count()),
+            squares,
+        )
     }
 
     /// Hold error over the bound from `from_s` on.
