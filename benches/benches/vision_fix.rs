@@ -1,6 +1,7 @@
 //! Time of one fix on a 25 x 25 window, compared with the same model fitted by a general Levenberg-Marquardt solver and with two
 //! methods without a template. Run: `cargo bench -p cellpos-benches --bench vision_fix`.
 
+use cellpos_numeric::Random;
 use cellpos_vision::{
     Detector, Frame, Localiser, LocaliserConfig, PixelNoise, PixelResponse, Pixels, Polarity,
     ProfileSpec, RadialProfile, RadialSymmetry, RingProfile,
@@ -32,7 +33,7 @@ fn main() {
     let mut localiser = Localiser::new(config).expect("the configuration is valid");
     let mut symmetry = RadialSymmetry::new(WINDOW);
     let mut detector = Detector::new(&localiser, 8);
-    let mut random = Random(1);
+    let mut random = Random::new(1);
     let mut scenes_of = |way_px| -> Vec<Scene> {
         let scene = |_| Scene::new(&mut random, way_px);
         (0..RUNS).map(scene).collect()
@@ -252,19 +253,4 @@ fn general_solver(profile: &RingProfile, scene: &Scene) -> Option<(f64, f64)> {
         .termination
         .was_successful()
         .then_some((solved.parameters[0], solved.parameters[1]))
-}
-
-/// xorshift64* and Box-Muller.
-struct Random(u64);
-
-impl Random {
-    fn uniform(&mut self) -> f64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-    fn normal(&mut self) -> f64 {
-        (-2.0 * (1.0 - self.uniform()).ln()).sqrt() * (std::f64::consts::TAU * self.uniform()).cos()
-    }
 }

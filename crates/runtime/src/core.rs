@@ -25,8 +25,6 @@ mod in_force;
 mod life_cycle;
 mod partner;
 mod rest;
-#[cfg(test)]
-mod test_noise;
 mod watches;
 
 use crate::arming::{Arming, ArmingConfig, ArmingState};

@@ -269,13 +269,8 @@ mod tests {
 
     #[test]
     fn jitter_at_the_edge_of_a_step_does_not_make_frames_fall_to_either_side_in_turn() {
-        let mut state = 1_u64;
-        let mut jitter = move || {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
-            (state % 200_000) as i64 - 100_000
-        };
+        let mut random = cellpos_numeric::Random::new(1);
+        let mut jitter = move || random.below(200_000) as i64 - 100_000;
         // 20 s for a period of drift, with a tenth of a period of jitter: every phase is passed.
         let frames = (1..600_000).map(|k| (k as f64 * 1e9 / 1000.05) as i64 + jitter());
         let paced = pace(frames);

@@ -132,26 +132,16 @@ fn noise_px(places: &[(u64, Option<f64>)]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cellpos_numeric::Random;
 
     /// Steps of a bead that wanders by `walk` per frame, with localisation noise 1, from random numbers of variance 1.
     fn noise_of(walk: f64) -> Option<f64> {
-        let mut state = 1_u64;
-        let mut normal = move || {
-            let sum: f64 = (0..12)
-                .map(|_| {
-                    state = state
-                        .wrapping_mul(6_364_136_223_846_793_005)
-                        .wrapping_add(1);
-                    (state >> 11) as f64 / (1_u64 << 53) as f64
-                })
-                .sum();
-            sum - 6.0
-        };
+        let mut random = Random::new(1);
         let mut x = 0.0;
         let places: Vec<(u64, Option<f64>)> = (0..20_000)
             .map(|id| {
-                x += walk * normal();
-                (id, (id % 50 != 7).then(|| x + normal()))
+                x += walk * random.normal();
+                (id, (id % 50 != 7).then(|| x + random.normal()))
             })
             .collect();
         noise_px(&places)

@@ -75,7 +75,7 @@ fn killed(kills: u32, cycles: u32) {
         folder,
         &["--duration", "1000s", "--new-bead-after", "100ms"],
     );
-    let mut seed = 0x9e37_79b9_7f4a_7c15_u64;
+    let mut random = cellpos_numeric::Random::new(1);
     let mut killed_ns = Vec::new();
     let mut before: Vec<u64> = Vec::new();
     // A busy machine ends a session now and then; it must not end them all.
@@ -101,12 +101,11 @@ fn killed(kills: u32, cycles: u32) {
             .stderr(std::process::Stdio::null())
             .spawn()
             .unwrap();
-        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         let last = killed_ns.len() as u32 >= kills;
         let ended = if last {
             Some(child.wait().unwrap())
         } else {
-            std::thread::sleep(Duration::from_millis(600 + (seed >> 33) % 2400));
+            std::thread::sleep(Duration::from_millis(600 + random.below(2400) as u64));
             child.try_wait().unwrap()
         };
         if ended.is_none() {

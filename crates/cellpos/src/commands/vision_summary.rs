@@ -270,27 +270,15 @@ fn uniformity(counts: &[u64; BINS]) -> f64 {
 mod tests {
     use super::*;
 
-    /// The sum of twelve uniform numbers: nearly normal, variance 1.
-    fn normal(state: &mut u64) -> f64 {
-        let mut sum = -6.0;
-        for _ in 0..12 {
-            *state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            sum += (*state >> 11) as f64 / (1_u64 << 53) as f64;
-        }
-        sum
-    }
-
     /// A bead that diffuses by `step_px` per frame and is located with the error `noise_px`.
     fn tally(frames: usize, step_px: f64, noise_px: f64) -> Tally {
-        let mut state = 3;
+        let mut random = cellpos_numeric::Random::new(3);
         let mut tally = Tally::default();
         let (mut x, mut y) = (100.0, 50.0);
         for n in 0..frames {
-            x += step_px * normal(&mut state);
-            y += step_px * normal(&mut state);
-            let (ex, ey) = (noise_px * normal(&mut state), noise_px * normal(&mut state));
+            x += step_px * random.normal();
+            y += step_px * random.normal();
+            let (ex, ey) = (noise_px * random.normal(), noise_px * random.normal());
             tally.fix(
                 n,
                 0,

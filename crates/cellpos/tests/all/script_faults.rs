@@ -15,7 +15,7 @@ const PATIENT: &str = "[timing]\noldest_ms = 1000.0\nfaults_in_a_row = 100000\nb
 fn killed_and_resumed(folder: &Path, cycles: u32, most: u32, extra: &[&str]) -> (PathBuf, u32) {
     script(folder, cycles);
     std::fs::write(folder.join("rig.toml"), PATIENT).unwrap();
-    let mut seed = 0x2545_f491_4f6c_dd1d_u64;
+    let mut random = cellpos_numeric::Random::new(1);
     let mut acknowledged: Vec<u64> = Vec::new();
     let mut kills = 0;
     let mut run: Option<PathBuf> = None;
@@ -35,9 +35,8 @@ fn killed_and_resumed(folder: &Path, cycles: u32, most: u32, extra: &[&str]) -> 
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
-        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         if kills < most {
-            std::thread::sleep(Duration::from_millis(300 + (seed >> 33) % 2500));
+            std::thread::sleep(Duration::from_millis(300 + random.below(2500) as u64));
         }
         let ended = kills >= most || child.try_wait().unwrap().is_some();
         if !ended {

@@ -73,20 +73,9 @@ mod tests {
     use crate::estimator::{EstimatorConfig, Fix};
     use crate::loop_model::LoopModel;
 
-    /// Normal deviates, by the sum of twelve.
-    fn noise(state: &mut u64) -> f64 {
-        let mut next = || {
-            *state ^= *state << 13;
-            *state ^= *state >> 7;
-            *state ^= *state << 17;
-            (*state >> 11) as f64 / (1u64 << 53) as f64
-        };
-        (0..12).map(|_| next()).sum::<f64>() - 6.0
-    }
-
     /// Square of the error over the stated variance, of a bead that is held for 2.5 s and not seen for 0.5 s.
     fn squared(seed: u64) -> f64 {
-        let mut draw = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+        let mut random = cellpos_numeric::Random::new(seed);
         let (gain, dt) = (380.0, 1e-3);
         let config = EstimatorConfig::default();
         let estimator = Estimator::new(config, LoopModel::integrator(gain, 2e-3)).unwrap();
@@ -96,7 +85,7 @@ mod tests {
         for k in 0..3000 {
             path = [bead_um, path[0], path[1]];
             let fix = Fix {
-                position_um: path[2] + 0.015 * noise(&mut draw),
+                position_um: path[2] + 0.015 * random.normal(),
                 variance_um2: 0.015 * 0.015,
                 age: 0,
                 offset: 0.0,
@@ -113,8 +102,8 @@ mod tests {
             };
             estimator.push(&mut state, command_um);
             bead_um += gain * dt * (command_um - zero_um)
-                + (2.0 * config.diffusion_um2_per_s * dt).sqrt() * noise(&mut draw);
-            zero_um += ZERO_FLOW_WALK_UM_PER_SQRT_S * dt.sqrt() * noise(&mut draw);
+                + (2.0 * config.diffusion_um2_per_s * dt).sqrt() * random.normal();
+            zero_um += ZERO_FLOW_WALK_UM_PER_SQRT_S * dt.sqrt() * random.normal();
         }
         unreachable!("the last tick returns from {command_um} um")
     }

@@ -102,16 +102,9 @@ mod tests {
     fn a_sine_is_predicted_and_white_noise_is_not() {
         for (amplitude, most) in [(0.0, 1.1), (10.0, 3.0)] {
             let mut colour = Colour::new(1.0);
-            let (mut state, mut squares) = (1_u64, 0.0);
+            let (mut random, mut squares) = (cellpos_numeric::Random::new(1), 0.0);
             for k in 0..20_000 {
-                let mut noise = -6.0;
-                for _ in 0..12 {
-                    state = state
-                        .wrapping_mul(6_364_136_223_846_793_005)
-                        .wrapping_add(1_442_695_040_888_963_407);
-                    noise += (state >> 11) as f64 / (1_u64 << 53) as f64;
-                }
-                let value = noise + amplitude * (0.3 * f64::from(k)).sin();
+                let value = random.normal() + amplitude * (0.3 * f64::from(k)).sin();
                 let mut series = [0.0; SERIES];
                 series[0] = value;
                 colour.take_out(&mut series, value);

@@ -27,17 +27,25 @@ impl White {
         }
     }
 
+    fn count(&self) -> usize {
+        self.lines
+            .cancelled(&self.settings)
+            .iter()
+            .flatten()
+            .count()
+    }
+
     fn second(&mut self) {
         let settings = self.settings;
         for _ in 0..(1.0 / settings.sample_s).round() as usize {
             self.tick += 1;
-            let before = self.lines.count();
+            let before = self.count();
             if self.tick.is_multiple_of(settings.interval as u64) {
                 let fix_um = self.random.normal();
                 (self.lines).learn(&settings, &self.whitener, (fix_um, 1.0), AGO);
             }
             self.lines.tick(&settings);
-            self.found += self.lines.count().saturating_sub(before);
+            self.found += self.count().saturating_sub(before);
         }
     }
 }

@@ -20,16 +20,10 @@ fn tones(lines: &'static [(f64, f64)]) -> Flow {
 
 /// An Ornstein-Uhlenbeck flow: corner, Hz, and RMS, um/s.
 fn coloured(hz: f64, um_per_s: f64) -> Flow {
-    let (keep, mut flow, mut state) = ((-TAU * hz * 1e-3).exp(), 0.0, 1_u64);
+    let (keep, mut flow) = ((-TAU * hz * 1e-3).exp(), 0.0);
+    let mut random = cellpos_numeric::Random::new(1);
     Box::new(move || {
-        let mut sum = 0.0;
-        for _ in 0..12 {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            sum += (state >> 11) as f64 / (1_u64 << 53) as f64;
-        }
-        flow = keep * flow + (1.0 - keep * keep).sqrt() * um_per_s * (sum - 6.0);
+        flow = keep * flow + (1.0 - keep * keep).sqrt() * um_per_s * random.normal();
         flow
     })
 }

@@ -243,12 +243,9 @@ mod tests {
 
     #[test]
     fn display_reads_back_to_the_same_value() {
-        let mut state = 1u64;
+        let mut random = crate::Random::new(1);
         for _ in 0..10_000 {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1);
-            let value = ((state >> 11) as f64 / (1u64 << 53) as f64 - 0.5) * 1e6;
+            let value = (random.uniform() - 0.5) * 1e6;
             assert_eq!(
                 format!("{}", Micrometers(value)).parse(),
                 Ok(Micrometers(value))

@@ -1,25 +1,23 @@
 //! The rig of these tests, and its faults.
 
 use super::*;
+use cellpos_numeric::Random;
 
 /// Numbers for the scheduler and the faults.
 #[derive(Debug, Clone)]
-pub(super) struct Dice(u64);
+pub(super) struct Dice(Random);
 
 impl Dice {
     pub(super) fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+        Self(Random::new(seed))
     }
 
     pub(super) fn next(&mut self) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11
+        self.0.bits() >> 11
     }
 
     pub(super) fn part(&mut self) -> f64 {
-        self.next() as f64 / (1_u64 << 53) as f64
+        self.0.uniform()
     }
 
     pub(super) fn hits(&mut self, probability: f64) -> bool {

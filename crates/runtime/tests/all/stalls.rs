@@ -136,7 +136,8 @@ fn hold(trouble: Trouble, adapt: bool, seed: u64, seconds: u64) -> (f64, u64) {
         ran.summary.safe_reason
     );
     // Nothing is periodic, and what a stall does is no line.
-    let lines = ran.summary.adaptation.map_or(0, |now| now.lines);
+    let lines =
+        (ran.summary.adaptation).map_or(0, |now| now.periodic_flows.iter().flatten().count());
     assert_eq!(lines, 0, "{trouble:?}, seed {seed}");
     let (squares_um2, ticks) = *sums.0.lock().unwrap();
     let rms_um = (squares_um2 / f64::from(ticks)).sqrt();

@@ -139,14 +139,10 @@ mod tests {
                 .add(&frame(30.0, 3.0), 0.0)
                 .is_some_and(|rest| rest.was_at(5.0))
         );
-        let mut noise = 1_u64;
+        let mut random = cellpos_numeric::Random::new(1);
         for _ in 0..400 {
-            noise = noise
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1);
-            let unit = (noise >> 11) as f64 / (1_u64 << 53) as f64 - 0.5;
-            // A noise of 0.1 um: the mean of 400 is known to 0.005.
-            resting.add(&frame(9.5 + 0.346 * unit, 0.05), 0.01);
+            // The mean of 400 is known to 0.005.
+            resting.add(&frame(9.5 + 0.1 * random.normal(), 0.05), 0.01);
         }
         let rest = resting
             .add(&frame(20.0, 0.4), 0.4)

@@ -228,8 +228,7 @@ mod tests {
     use crate::plan::ArmKind;
 
     fn noise(k: u64) -> f64 {
-        let hash = k.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        ((hash ^ (hash >> 29)) >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        cellpos_numeric::Random::new(k).uniform() - 0.5
     }
 
     #[test]
@@ -280,27 +279,14 @@ mod tests {
         );
     }
 
-    /// Splitmix64: unlike the even steps of [`noise`], numbers that follow each other are independent.
-    fn white(k: u64) -> f64 {
-        let mut z = k.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-    }
-
     /// The interval of the mean of ten cycles with a steady change follows from their scatter alone: the change is not scatter.
     #[test]
     fn the_interval_of_a_mean_leaves_a_steady_change_out() {
         let (mut inside, mut widest) = (0, 0.0_f64);
         for draw in 0..400 {
-            // The sum of twelve even values has a standard deviation of one.
-            let scatter = |k: u64| {
-                (0..12)
-                    .map(|n| white(12 * (10 * draw + k) + n))
-                    .sum::<f64>()
-            };
+            let mut random = cellpos_numeric::Random::new(draw);
             let points: Vec<(f64, f64)> = (0..10)
-                .map(|k| (k as f64, 5.0 * k as f64 + scatter(k)))
+                .map(|k| (f64::from(k), 5.0 * f64::from(k) + random.normal()))
                 .collect();
             let found = Mean::of(&points);
             inside += u64::from((found.mean - 22.5).abs() < found.ci95);

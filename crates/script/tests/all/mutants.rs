@@ -2,27 +2,11 @@
 
 use crate::common;
 use cellpos_emulator::WorldConfig;
+use cellpos_numeric::Random;
 use cellpos_plant::Model;
 use cellpos_runtime::Timing;
 use cellpos_script::{CheckError, CheckLimits, Plan, Script, check};
 use std::path::Path;
-
-/// Numbers that a seed fixes.
-struct Luck(u64);
-
-impl Luck {
-    fn uniform(&mut self) -> f64 {
-        self.0 = self
-            .0
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        ((self.uniform() * n as f64) as usize).min(n.saturating_sub(1))
-    }
-}
 
 /// Bytes of every quantity (number and unit in quotes) of a text: of its number.
 fn quantities(text: &str) -> Vec<std::ops::Range<usize>> {
@@ -43,7 +27,7 @@ fn quantities(text: &str) -> Vec<std::ops::Range<usize>> {
 }
 
 /// One change at random.
-fn mutate(text: &mut String, luck: &mut Luck) {
+fn mutate(text: &mut String, luck: &mut Random) {
     const WORDS: [&[&str]; 4] = [
         &[
             "\"sine\"",
@@ -57,7 +41,7 @@ fn mutate(text: &mut String, luck: &mut Luck) {
         &["\"mean\"", "\"peak\"", "\"random\"", "\"reversed\""],
     ];
     let blocks: Vec<usize> = text.match_indices("[[step]]").map(|(at, _)| at).collect();
-    let block = |luck: &mut Luck| {
+    let block = |luck: &mut Random| {
         let first = luck.below(blocks.len());
         let end = blocks.get(first + 1).copied().unwrap_or(text.len());
         blocks.get(first).copied().unwrap_or(0)..end
@@ -116,7 +100,7 @@ fn mutants(count: u32) {
         view_um: 12.0,
         ..CheckLimits::default()
     };
-    let mut luck = Luck(17);
+    let mut luck = Random::new(17);
     let (mut errors, mut refused, mut run) = (0, 0, 0);
     let mut highest: f64 = 0.0;
     for number in 0..count {

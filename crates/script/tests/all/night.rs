@@ -102,14 +102,6 @@ fn ten_thousand_cycles_with_faults_are_in_the_table_once() {
     eprintln!("wall time {took_s:.1} s");
 }
 
-/// Uniform numbers that a seed fixes.
-fn uniform(seed: &mut u64) -> f64 {
-    *seed = seed
-        .wrapping_mul(6_364_136_223_846_793_005)
-        .wrapping_add(1_442_695_040_888_963_407);
-    (*seed >> 11) as f64 / (1u64 << 53) as f64
-}
-
 #[test]
 fn a_script_that_passes_the_check_does_not_saturate_on_the_rig() {
     let limits = CheckLimits {
@@ -117,11 +109,11 @@ fn a_script_that_passes_the_check_does_not_saturate_on_the_rig() {
         view_um: 12.0,
         ..CheckLimits::default()
     };
-    let mut seed = 3;
+    let mut random = cellpos_numeric::Random::new(3);
     let (mut run, mut refused) = (0u32, 0u32);
     let mut highest: f64 = 0.0;
     for _ in 0..60 {
-        let mut pick = |low: f64, high: f64| low + (high - low) * uniform(&mut seed);
+        let mut pick = |low: f64, high: f64| low + (high - low) * random.uniform();
         let shape = ["sine", "triangle", "trapezoid"][pick(0.0, 2.999) as usize];
         let frequency = pick(0.5f64.ln(), 120f64.ln()).exp();
         let amplitude = pick(0.2f64.ln(), 30f64.ln()).exp();

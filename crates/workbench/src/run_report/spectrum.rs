@@ -130,13 +130,8 @@ mod tests {
 
     #[test]
     fn the_spectrum_of_white_noise_is_flat_and_holds_its_variance() {
-        let mut seed = 7u64;
-        let mut values: Vec<f64> = (0..60_000)
-            .map(|_| {
-                seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-                (seed >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-            })
-            .collect();
+        let mut random = cellpos_numeric::Random::new(7);
+        let mut values: Vec<f64> = (0..60_000).map(|_| random.uniform() - 0.5).collect();
         for k in (0..values.len()).step_by(97) {
             values[k] = f64::NAN;
         }

@@ -218,13 +218,10 @@ mod tests {
 
     #[test]
     fn a_nights_histogram_is_that_of_all_values_within_a_narrow_bin() {
-        let mut seed = 3u64;
+        let mut random = cellpos_numeric::Random::new(3);
         let mut values: Vec<f64> = (0..3 * KEPT)
             .map(|_| {
-                let mut unit = || {
-                    seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-                    (seed >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-                };
+                let mut unit = || random.uniform() - 0.5;
                 100.0 * (unit() + unit() + unit())
             })
             .collect();

@@ -1,7 +1,7 @@
 //! Flows, signs and clips by hand.
 
 use super::*;
-use crate::core::test_noise::noise;
+use cellpos_numeric::Random;
 
 /// What a loop meets, as functions of time.
 struct World<'a> {
@@ -64,7 +64,7 @@ type Finding = (f64, f64, Instead);
 
 /// A proportional loop with an integral on an integrator, which pauses when it is told to.
 fn found_by(world: &World<'_>) -> Option<Finding> {
-    let mut state = world.seed;
+    let mut random = Random::new(world.seed);
     let dt = 1.0 / world.rate_hz;
     let model = LoopModel {
         sample_time_s: dt,
@@ -100,7 +100,7 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
         stood_um = asked_um;
         let pushed_um = asked_um - (world.zero_flow)(t);
         bead_um += world.axis * (world.gain_ratio)(t) * 380.0 * dt * pushed_um
-            + (0.66 * dt).sqrt() * noise(&mut state);
+            + (0.66 * dt).sqrt() * random.normal();
         seen.push_back(bead_um);
         seen.pop_front();
         if (world.lost)(k) {
@@ -115,13 +115,13 @@ fn found_by(world: &World<'_>) -> Option<Finding> {
             seen[at + 1]
         };
         let shown_um = seen[at] + part.abs() * (other - seen[at]);
-        let fix_um = shown_um + (world.shakes)(t) + 0.015 * noise(&mut state);
+        let fix_um = shown_um + (world.shakes)(t) + 0.015 * random.normal();
         let reference_um = (world.reference)(t);
         let error_um = world.axis * (fix_um - reference_um);
         zero_um -= 8.0 * dt * error_um;
         let before_um = side_um;
         if k % 2 == 0 && world.dither_um > 0.0 {
-            side_um = world.dither_um * noise(&mut state).signum();
+            side_um = world.dither_um * random.normal().signum();
         }
         let dither_um = side_um - before_um;
         let driven_um = zero_um - 0.4 * error_um + (world.added)(t) + dither_um;
@@ -345,8 +345,8 @@ fn a_loop_that_loses_ticks_in_fast_motion_is_not_taken_for_one_with_a_wrong_sign
     for seed in 1..=10 {
         // A fifth of the ticks, up to eight in a row.
         let lost = |k: u64| {
-            let mut state = seed * 7919 + k / 8;
-            let draw = noise(&mut state).abs();
+            let mut random = Random::new(seed * 7919 + k / 8);
+            let draw = random.normal().abs();
             draw < 0.5 && (k % 8) as f64 > 12.0 * draw + 2.0
         };
         let told = found_by(&World {
