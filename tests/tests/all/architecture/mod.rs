@@ -287,6 +287,42 @@ fn no_test_that_lacks_its_records_is_green() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// Files with random numbers of their own.
+const OWN_CHANCE: [&str; 7] = [
+    "crates/numeric/src/random.rs",
+    // A seed fixes the order of a sweep in runs that labs have recorded, and that of the table of adaptation.
+    "crates/script/src/shuffle.rs",
+    "benches/src/adaptation.rs",
+    // Grey levels, as sums of bytes.
+    "crates/cellpos/tests/all/vision.rs",
+    "crates/drivers/tests/fake_camera.rs",
+    // Written apart from the crates.
+    "tests/src/attack.rs",
+    "tests/src/truth/random.rs",
+];
+
+#[test]
+fn random_numbers_come_from_one_generator() {
+    let mut files = Vec::new();
+    for package in packages() {
+        sources(&root().join(&package), &mut files);
+    }
+    let is_generator = |line: &str| {
+        let multiplies = ["6_364_136_223", "6364136223", "0x2545_f491", "0xbf58_476d"];
+        multiplies.iter().any(|factor| line.contains(factor))
+            || line.contains("^=") && line.contains(" << ")
+    };
+    let own = files.iter().filter_map(|file| {
+        let at = file.strip_prefix(root()).unwrap().display().to_string();
+        let text = std::fs::read_to_string(file).unwrap().to_lowercase();
+        let is_here = at == "tests/tests/all/architecture/mod.rs";
+        (!is_here && text.lines().any(is_generator)).then_some(at)
+    });
+    let own: std::collections::BTreeSet<String> = own.collect();
+    let known = OWN_CHANCE.map(str::to_owned).into();
+    assert_eq!(own, known, "take cellpos_numeric::Random");
+}
+
 /// `.ci/nightly` asks the test programs for what they ignore: all of it but tests of this name, and programs that need a feature.
 const DRAWS: &str = "draw_";
 
