@@ -153,19 +153,24 @@ impl Detector {
     where
         f32: From<T>,
     {
-        let mut best = 0.0_f32;
+        /// Columns whose largest contrasts are kept apart: one for all would wait for every comparison before it.
+        const APART: usize = 8;
+        let mut best = [0.0_f32; APART];
         if width < PATCH || height < PATCH {
-            return best;
+            return 0.0;
         }
         for y in (0..=height - PATCH).step_by(step) {
             patch_sums(pixels, width, y, &mut self.sums);
             let levels = self.level.row(y + 1).get(1..).unwrap_or(&[]);
-            for (sum, level) in self.sums.iter().zip(levels) {
-                let contrast = sign * (sum / (PATCH * PATCH) as f32 - level);
-                best = if contrast > best { contrast } else { best };
+            let parts = self.sums.chunks(APART).zip(levels.chunks(APART));
+            for (sums, levels) in parts {
+                for ((best, sum), level) in best.iter_mut().zip(sums).zip(levels) {
+                    let contrast = sign * (sum / (PATCH * PATCH) as f32 - level);
+                    *best = if contrast > *best { contrast } else { *best };
+                }
             }
         }
-        best
+        best.into_iter().fold(0.0, f32::max)
     }
 
     /// Keeps of the last look what no stronger one has shown.

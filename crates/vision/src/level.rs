@@ -75,11 +75,18 @@ impl Level {
                 let step = (across * down / SAMPLES).max(1) | 1;
                 let mut samples = [0.0_f32; SAMPLES];
                 let mut n = 0;
-                for k in (0..across * down).step_by(step) {
-                    let at = (y0 + k / across) * width + x0 + k % across;
-                    if let (Some(slot), Some(v)) = (samples.get_mut(n), pixels.get(at)) {
-                        *slot = f32::from(*v);
-                        n += 1;
+                let (whole_rows, rest) = (step / across, step % across);
+                let (mut x, mut y) = (0, 0);
+                for slot in &mut samples {
+                    let Some(v) = pixels.get((y0 + y) * width + x0 + x).filter(|_| y < down) else {
+                        break;
+                    };
+                    *slot = f32::from(*v);
+                    n += 1;
+                    // The next of the tile's pixels, counted row by row, that is `step` further.
+                    (x, y) = (x + rest, y + whole_rows);
+                    if x >= across {
+                        (x, y) = (x - across, y + 1);
                     }
                 }
                 let samples = &mut samples[..n];
@@ -115,7 +122,8 @@ impl Level {
         let share = place - upper as f32;
         self.row.clear();
         let parts = self.upper.iter().zip(&self.rise);
-        self.row.extend(parts.map(|(level, rise)| level + share * rise));
+        self.row
+            .extend(parts.map(|(level, rise)| level + share * rise));
     }
 
     /// Fills a line of pixels from values in the middles of tiles: straight from one middle to the next, level before the first and
