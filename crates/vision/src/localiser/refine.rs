@@ -4,6 +4,7 @@ use super::judge::WIDENED_RATIO;
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
+use crate::dust::{self, Speck};
 use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
@@ -11,6 +12,10 @@ use crate::speckle;
 /// How often specks are searched in the residual of a fit: each time those at least half as strong as the strongest are left out.
 const MOST_LOOKS_FOR_SPECKS: usize = 5;
 
+/// Most specks beside a bead that are fitted.
+const MOST_SPECKS: usize = 2;
+/// Standard deviations of the sum of squares from which specks beside the bead are looked for.
+const LEAST_EXCESS: f64 = 3.0;
 /// Least share of a fit's excess residual that offsets of the lines must explain to count.
 const LEAST_OF_LINES: f64 = 0.5;
 
@@ -59,13 +64,19 @@ impl Localiser {
             fitted = self.fit(view, at, side_px, 0);
             left = fitted.as_ref().map(|f| self.left_by(f));
         }
-        let (f, l) = (
-            Fitted {
-                left: left?,
-                ..fitted?
-            },
-            left?,
-        );
+        let mut f = Fitted {
+            left: left?,
+            ..fitted?
+        };
+        if !view.is_draft && self.comb.is_still() {
+            for _ in 0..MOST_SPECKS {
+                match self.with_speck(&f) {
+                    Some(found) => f = found,
+                    None => break,
+                }
+            }
+        }
+        let l = f.left;
         let level = f.pass.background + f64::from(self.crop.pedestal);
         // If the residual is wider or larger than noise, its score is, too.
         let asked = l.asks(self.pixel_variance(level) * self.widened.mean.max(1.0));
@@ -102,6 +113,45 @@ impl Localiser {
             left: self.left_by(&found),
             ..found
         })
+    }
+
+    /// The fit of a bead together with a speck beside it, whose light is taken off the window, if a speck explains more than its price.
+    fn with_speck(&mut self, f: &Fitted) -> Option<Fitted> {
+        let unit = self.weight_unit();
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        let before = f.pass.chi2 / unit;
+        // What chance leaves moves the bead by less than its own noise.
+        if before < pixels + LEAST_EXCESS * (2.0 * pixels).sqrt() {
+            return None;
+        }
+        let place = (f.x_px - self.crop.x0 as f64, f.y_px - self.crop.y0 as f64);
+        self.residues
+            .take_off_mean(&self.crop, (place.0 as f32, place.1 as f32));
+        let variance = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        let radius_px = self.template.radius_px();
+        let left = self.residues.left.as_slice();
+        let noise = variance.sqrt() as f32;
+        let first = Speck::seen(&self.crop, left, place, radius_px, noise)?;
+        let weights = self.weights(Some(&f.pass));
+        let at = (f.x_px, f.y_px);
+        let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
+        let other = f.left.explained_by_slope_and_size() / variance;
+        let after = both.pass.chi2 / unit;
+        if !dust::pays(&self.crop, radius_px, before, after, other) {
+            return None;
+        }
+        both.speck.take_off(&mut self.crop);
+        let (x_px, y_px) = both.place_px;
+        let found = Fitted {
+            x_px,
+            y_px,
+            pass: both.pass,
+            converged: f.converged,
+            slope: f.slope,
+            left: f.left,
+        };
+        let left = self.left_by(&found);
+        Some(Fitted { left, ..found })
     }
 
     /// Widens a good fix's covariance by the offsets that rows and columns have had in the last fixes, and takes in this one's.
