@@ -70,9 +70,12 @@ impl Localiser {
         };
         if !view.is_draft && self.comb.is_still() {
             for _ in 0..MOST_SPECKS {
-                match self.with_speck(&f) {
-                    Some(found) => f = found,
-                    None => break,
+                let Some(found) = self.with_speck(&f) else {
+                    break;
+                };
+                f = found;
+                if side_px == self.config.window_px {
+                    self.read_noise_beside(&f);
                 }
             }
         }
@@ -117,7 +120,11 @@ impl Localiser {
 
     /// The fit of a bead together with a speck beside it, whose light is taken off the window, if a speck explains more than its price.
     fn with_speck(&mut self, f: &Fitted) -> Option<Fitted> {
-        let unit = self.weight_unit();
+        let level = f.pass.background + f64::from(self.crop.pedestal);
+        let own = self.pixel_variance(level);
+        // A speck at the border counts as noise there.
+        let least = self.usual_noise().unwrap_or(own).min(own) / own;
+        let unit = self.weight_unit() * least;
         let pixels = (self.crop.width * self.crop.height) as f64;
         let before = f.pass.chi2 / unit;
         // What chance leaves moves the bead by less than its own noise.
@@ -127,7 +134,7 @@ impl Localiser {
         let place = (f.x_px - self.crop.x0 as f64, f.y_px - self.crop.y0 as f64);
         self.residues
             .take_off_mean(&self.crop, (place.0 as f32, place.1 as f32));
-        let variance = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        let variance = own * least;
         let radius_px = self.template.radius_px();
         let left = self.residues.left.as_slice();
         let noise = variance.sqrt() as f32;
