@@ -23,6 +23,8 @@ const SHAPE_RADII: f64 = 3.0;
 const NARROWEST_PX2: f32 = 0.5;
 /// A speck's middle is farther from that of the bead than this, bead radii: what is on the bead is part of its picture.
 const APART_RADII: f64 = 1.0;
+/// The same in the speck's standard deviations: the bead has less than a seventh of the speck's light in its middle.
+const APART_SIGMAS: f64 = 2.0;
 /// Parameters of the speck, and of the whole fit.
 const OWN: usize = 6;
 const ALL: usize = 4 + OWN;
@@ -108,19 +110,40 @@ impl Speck {
         })
     }
 
-    /// Standard deviations along the shortest and the longest axis, px.
-    fn widths(&self) -> (f64, f64) {
-        let (p, q, s) = (
-            self.a * self.a,
-            self.a * self.b,
-            self.b * self.b + self.c * self.c,
-        );
-        let (mean, half) = (0.5 * (p + s), 0.5 * (p - s));
-        let root = half.hypot(q);
-        (
-            (mean + root).sqrt().recip(),
-            (mean - root).max(1e-9).sqrt().recip(),
-        )
+    /// Standard deviation along the shortest axis, px.
+    fn shortest_px(&self) -> f64 {
+        let (p, q) = (self.a * self.a, self.a * self.b);
+        let s = self.b * self.b + self.c * self.c;
+        (0.5 * (p + s) + f64::hypot(0.5 * (p - s), q))
+            .sqrt()
+            .recip()
+    }
+
+    /// Whether a bead at a place of the window is beside the speck: away from its middle, and from its length.
+    fn is_apart(&self, (x, y): (f64, f64), radius_px: f64) -> bool {
+        let (dx, dy) = (x - self.x, y - self.y);
+        let sigmas = f64::hypot(self.a * dx + self.b * dy, self.c * dy);
+        f64::hypot(dx, dy) > APART_RADII * radius_px && sigmas > APART_SIGMAS
+    }
+
+    /// Largest difference that the speck makes in the window, grey levels; infinite if it is no number.
+    fn brightest(&self, crop: &Crop) -> f64 {
+        let mut most = f32x4::ZERO;
+        for j in 0..crop.height {
+            let dy = f32x4::splat(j as f32 - self.y as f32);
+            let mut dx = FIRST_COLUMNS - f32x4::splat(self.x as f32);
+            for _ in (0..crop.lanes_end()).step_by(LANES) {
+                most = most.fast_max(self.light(dx, dy).0);
+                dx += f32x4::splat(LANES as f32);
+            }
+        }
+        let most = f64::from(most.to_array().into_iter().fold(0.0, f32::max));
+        let brightest = most * self.contrast.abs();
+        if brightest.is_finite() {
+            brightest
+        } else {
+            f64::INFINITY
+        }
     }
 
     /// Light for a contrast of 1 in four pixels, with `u` and `v`.
@@ -223,12 +246,11 @@ pub(crate) fn fit(
         chi2,
         covariance: inverse.fixed_view::<2, 2>(0, 0) / (amplitude * amplitude),
     };
-    let (x, y) = (at.0 - crop.x0 as f64, at.1 - crop.y0 as f64);
-    let (short_px, long_px) = speck.widths();
-    let is_speck = squared(speck.x - x, speck.y - y) > (APART_RADII * radius_px).powi(2)
-        && short_px < radius_px
-        && long_px < crop.width.max(crop.height) as f64
-        && speck.contrast.is_finite()
+    let bead = (at.0 - crop.x0 as f64, at.1 - crop.y0 as f64);
+    let is_speck = speck.is_apart(bead, radius_px)
+        && speck.shortest_px() < radius_px
+        // Beside something stronger there is no telling its edge from a bead.
+        && speck.brightest(crop) < amplitude.abs()
         && f64::hypot(at.0 - start_px.0, at.1 - start_px.1) < radius_px;
     is_speck.then_some(Both {
         place_px: at,
@@ -334,6 +356,12 @@ impl Sums {
     }
 }
 
+/// Pixels over which what is neither noise nor the model is alike: a disc of half a bead's radius, the finest part of a picture that
+/// is as sharp as the bead.
+pub(crate) fn alike_px(radius_px: f64) -> f64 {
+    (core::f64::consts::PI * 0.25 * radius_px * radius_px).max(1.0)
+}
+
 /// Whether a speck explains enough: what it takes off the sum of squares (`before` to `after`, variances of noise) beyond the price
 /// of its parameters, that is their number times the logarithm of the number of pixels (Schwarz 1978), and beyond what `other`
 /// parameters would take off. What the fit leaves beyond noise is a template's error, alike over patches of half a bead radius: there a
@@ -341,7 +369,6 @@ impl Sums {
 pub(crate) fn pays(crop: &Crop, radius_px: f64, before: f64, after: f64, other: f64) -> bool {
     let pixels = (crop.width * crop.height) as f64;
     let excess = (after / (pixels - ALL as f64) - 1.0).max(0.0);
-    let patch = (core::f64::consts::PI * 0.25 * radius_px * radius_px).max(1.0);
-    let price = OWN as f64 * pixels.ln() * (1.0 + patch * excess);
+    let price = OWN as f64 * pixels.ln() * (1.0 + alike_px(radius_px) * excess);
     before - after > price + other
 }

@@ -138,7 +138,8 @@ impl Localiser {
         let radius_px = self.template.radius_px();
         let left = self.residues.left.as_slice();
         let noise = variance.sqrt() as f32;
-        let first = Speck::seen(&self.crop, left, place, radius_px, noise)?;
+        let first = Speck::seen(&self.crop, left, place, radius_px, noise);
+        let first = first?;
         let weights = self.weights(Some(&f.pass));
         let at = (f.x_px, f.y_px);
         let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
