@@ -157,14 +157,23 @@ impl Speck {
 
     /// Takes the speck's light off a window.
     pub(crate) fn take_off(&self, crop: &mut Crop) {
+        self.add(crop, -self.contrast);
+    }
+
+    /// Undoes [`Speck::take_off`].
+    pub(crate) fn put_back(&self, crop: &mut Crop) {
+        self.add(crop, self.contrast);
+    }
+
+    fn add(&self, crop: &mut Crop, contrast: f64) {
         let (lanes_end, height) = (crop.lanes_end(), crop.height);
-        let contrast = f32x4::splat(self.contrast as f32);
+        let contrast = f32x4::splat(contrast as f32);
         for (j, row) in crop.rows.iter_mut().enumerate().take(height) {
             let dy = f32x4::splat(j as f32 - self.y as f32);
             let mut dx = FIRST_COLUMNS - f32x4::splat(self.x as f32);
             for four in row[..lanes_end].as_chunks_mut::<LANES>().0 {
                 let (light, ..) = self.light(dx, dy);
-                *four = (f32x4::from(*four) - contrast * light).to_array();
+                *four = (f32x4::from(*four) + contrast * light).to_array();
                 dx += f32x4::splat(LANES as f32);
             }
         }

@@ -20,7 +20,8 @@ impl Localiser {
     /// widens the variance of the place widens that of the contrast.
     pub(super) fn is_certain(&self, pass: &Pass, at: (f64, f64), widening: f64) -> bool {
         let unit = self.weight_unit();
-        let variance = unit * widening * self.noise_alike() * pass.amplitude_variance;
+        let widening = widening.max(self.noise_alike());
+        let variance = unit * widening * pass.amplitude_variance;
         let exceeds = |contrast: f64, variance: f64, sigmas: f64| {
             contrast > 0.0 && contrast * contrast > sigmas * sigmas * variance
         };

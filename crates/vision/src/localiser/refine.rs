@@ -69,15 +69,7 @@ impl Localiser {
             ..fitted?
         };
         if !view.is_draft && self.comb.is_still() {
-            for _ in 0..MOST_SPECKS {
-                let Some(found) = self.with_speck(&f) else {
-                    break;
-                };
-                f = found;
-                if side_px == self.config.window_px {
-                    self.read_noise_beside(&f);
-                }
-            }
+            f = self.without_specks(f, side_px);
         }
         let l = f.left;
         let level = f.pass.background + f64::from(self.crop.pedestal);
@@ -118,13 +110,37 @@ impl Localiser {
         })
     }
 
+    /// The fit without the light of specks beside the bead, if what is left then is noise. Else the window is as it was: a wall or a
+    /// third speck is not explained by an ellipse, and bends it.
+    fn without_specks(&mut self, first: Fitted, side_px: usize) -> Fitted {
+        let mut specks = [None; MOST_SPECKS];
+        let mut last = None;
+        for slot in &mut specks {
+            let Some((found, speck)) = self.with_speck(last.as_ref().unwrap_or(&first)) else {
+                break;
+            };
+            (last, *slot) = (Some(found), Some(speck));
+        }
+        let Some(last) = last else {
+            return first;
+        };
+        if self.leaves_noise(&last) {
+            if side_px == self.config.window_px {
+                self.read_noise_beside(&last);
+            }
+            return last;
+        }
+        for speck in specks.iter().flatten() {
+            speck.put_back(&mut self.crop);
+        }
+        first
+    }
+
     /// The fit of a bead together with a speck beside it, whose light is taken off the window, if a speck explains more than its price.
-    fn with_speck(&mut self, f: &Fitted) -> Option<Fitted> {
-        let level = f.pass.background + f64::from(self.crop.pedestal);
-        let own = self.pixel_variance(level);
-        // A speck at the border counts as noise there.
-        let least = self.usual_noise().unwrap_or(own).min(own) / own;
-        let unit = self.weight_unit() * least;
+    fn with_speck(&mut self, f: &Fitted) -> Option<(Fitted, Speck)> {
+        let variance = self.least_variance(f);
+        let own = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        let unit = self.weight_unit() * variance / own;
         let pixels = (self.crop.width * self.crop.height) as f64;
         let before = f.pass.chi2 / unit;
         // What chance leaves moves the bead by less than its own noise.
@@ -134,12 +150,10 @@ impl Localiser {
         let place = (f.x_px - self.crop.x0 as f64, f.y_px - self.crop.y0 as f64);
         self.residues
             .take_off_mean(&self.crop, (place.0 as f32, place.1 as f32));
-        let variance = own * least;
         let radius_px = self.template.radius_px();
         let left = self.residues.left.as_slice();
         let noise = variance.sqrt() as f32;
-        let first = Speck::seen(&self.crop, left, place, radius_px, noise);
-        let first = first?;
+        let first = Speck::seen(&self.crop, left, place, radius_px, noise)?;
         let weights = self.weights(Some(&f.pass));
         let at = (f.x_px, f.y_px);
         let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
@@ -159,7 +173,24 @@ impl Localiser {
             left: f.left,
         };
         let left = self.left_by(&found);
-        Some(Fitted { left, ..found })
+        Some((Fitted { left, ..found }, both.speck))
+    }
+
+    /// Whether what a fit leaves is noise, besides its mean all round.
+    fn leaves_noise(&mut self, f: &Fitted) -> bool {
+        let variance = self.least_variance(f);
+        let at = (f.x_px, f.y_px);
+        let parts = (f.pass.amplitude, f.pass.background);
+        let left = self
+            .residues
+            .lopsided(&self.crop, &self.template, &self.comb, at, parts);
+        left <= WIDENED_RATIO * variance
+    }
+
+    /// Noise variance of a pixel at a fit's level, grey^2. A speck at the border counts as noise there: the last windows tell it better.
+    fn least_variance(&self, f: &Fitted) -> f64 {
+        let own = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        self.usual_noise().unwrap_or(own).min(own)
     }
 
     /// Widens a good fix's covariance by the offsets that rows and columns have had in the last fixes, and takes in this one's.
