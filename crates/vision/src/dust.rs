@@ -268,8 +268,8 @@ pub(crate) fn fit(
     })
 }
 
-/// Normal equations at a place: columns are the bead's derivatives by place, its light, the level, the speck's light, and its derivatives by place
-/// and shape. Nonlinear parameters are in steps times the contrast.
+/// Normal equations at a place: columns are the bead's derivatives by place, its light, the level, the speck's light, and its
+/// derivatives by place and shape. Nonlinear parameters are in steps times the contrast.
 struct Sums {
     normal: SMatrix<f64, ALL, ALL>,
     right: SVector<f64, ALL>,
