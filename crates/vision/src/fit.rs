@@ -11,6 +11,9 @@ use crate::template::Template;
 use nalgebra::{Matrix2, Matrix3, Matrix4, Vector3, Vector4};
 use wide::f32x4;
 
+/// Numbers of the first columns of a row.
+pub(crate) const FIRST_COLUMNS: f32x4 = f32x4::new([0.0, 1.0, 2.0, 3.0]);
+
 /// How the noise of a pixel depends on its grey level.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Weights {
@@ -128,8 +131,6 @@ pub(crate) fn pass(
 /// One row of the model's image and its derivatives by the centre.
 pub(crate) struct Image {
     lanes_end: usize,
-    entry: [u32; STRIDE],
-    offset: Row,
     pub value: Row,
     pub by_x: Row,
     pub by_y: Row,
@@ -139,45 +140,38 @@ impl Image {
     pub(crate) fn new(lanes_end: usize) -> Self {
         Image {
             lanes_end,
-            entry: [0; STRIDE],
-            offset: [0.0; STRIDE],
             value: [0.0; STRIDE],
             by_x: [0.0; STRIDE],
             by_y: [0.0; STRIDE],
         }
     }
 
-    /// The row `dy` px below the centre, in the column `x`.
+    /// Draws the row `dy` px below the centre, in the column `x`.
     #[inline(always)]
     pub(crate) fn draw_row(&mut self, template: &Template, comb: &Comb, x: f32, dy: f32) {
-        let n = self.lanes_end;
-        let factor = -2.0 * template.slope_factor();
+        let n = self.lanes_end.min(STRIDE);
+        let factor = f32x4::splat(-2.0 * template.slope_factor());
         let mut first = true;
         for (ox, oy) in comb.offsets() {
-            let (x, dy) = (x + ox, dy - oy);
+            let (x, dy) = (f32x4::splat(x + ox), f32x4::splat(dy - oy));
             let dy2 = dy * dy;
-            let rooms = self.entry.iter_mut().zip(&mut self.offset).take(n);
-            for (i, (e, t)) in rooms.enumerate() {
-                let dx = i as f32 - x;
-                (*e, *t) = template.place(dx * dx + dy2);
-            }
-            let places = self.entry.iter().zip(&self.offset).take(n);
-            let rows = self
-                .value
-                .iter_mut()
-                .zip(&mut self.by_x)
-                .zip(&mut self.by_y);
-            for (i, (((v, gx), gy), (e, t))) in rows.zip(places).enumerate() {
-                let (f, df) = template.read((*e, *t));
+            let mut column = FIRST_COLUMNS;
+            let rows = (self.value[..n].as_chunks_mut::<LANES>().0.iter_mut())
+                .zip(self.by_x[..n].as_chunks_mut::<LANES>().0)
+                .zip(self.by_y[..n].as_chunks_mut::<LANES>().0);
+            for ((value, by_x), by_y) in rows {
+                let dx = column - x;
+                column += f32x4::splat(LANES as f32);
+                let (f, df) = template.at_lanes(dx * dx + dy2);
                 // The derivative by the centre is minus twice that by the squared radius, times the distance.
                 let g = factor * df;
-                let (fx, fy) = (g * (i as f32 - x), g * dy);
-                if first {
-                    (*v, *gx, *gy) = (f, fx, fy);
-                } else {
-                    *v += f;
-                    *gx += fx;
-                    *gy += fy;
+                let (fx, fy) = (g * dx, g * dy);
+                for (to, new) in [(value, f), (by_x, fx), (by_y, fy)] {
+                    *to = if first {
+                        new.to_array()
+                    } else {
+                        (f32x4::from(*to) + new).to_array()
+                    };
                 }
             }
             first = false;

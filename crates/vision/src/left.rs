@@ -65,6 +65,11 @@ impl Left {
         fibre::explains(crop, at, radius_px, (cos, sin), sign) > self.contrast
     }
 
+    /// What light that rises and another size would take off the sum of squares, grey^2.
+    pub(crate) fn explained_by_slope_and_size(&self) -> f64 {
+        self.scores.iter().map(|score| score * score).sum()
+    }
+
     /// What the window asks for besides place, contrast and level, where noise of a variance is all that is left.
     pub(crate) fn asks(&self, variance: f64) -> Asked {
         let [along, down, size] = self.scores.map(|z| z * z / variance);

@@ -15,6 +15,10 @@ pub(crate) struct Level {
     rows: usize,
     tile: (f32, f32),
     values: [[f32; MOST]; MOST],
+    /// Level along the middles of the row of tiles at or above the row last asked for, and how much it rises to the next one.
+    upper: Vec<f32>,
+    rise: Vec<f32>,
+    upper_tile: usize,
     /// Level along the row last asked for.
     row: Vec<f32>,
     y: usize,
@@ -28,6 +32,9 @@ impl Level {
             rows: 1,
             tile: (1.0, 1.0),
             values: [[0.0; MOST]; MOST],
+            upper: Vec::with_capacity(WIDEST),
+            rise: Vec::with_capacity(WIDEST),
+            upper_tile: usize::MAX,
             row: Vec::with_capacity(WIDEST),
             y: usize::MAX,
             width: 0,
@@ -54,7 +61,7 @@ impl Level {
             width as f32 / self.columns as f32,
             height as f32 / self.rows as f32,
         );
-        (self.y, self.width) = (usize::MAX, width);
+        (self.y, self.upper_tile, self.width) = (usize::MAX, usize::MAX, width);
         self.values[0][0] = mean;
         if self.columns * self.rows == 1 {
             return;
@@ -68,11 +75,18 @@ impl Level {
                 let step = (across * down / SAMPLES).max(1) | 1;
                 let mut samples = [0.0_f32; SAMPLES];
                 let mut n = 0;
-                for k in (0..across * down).step_by(step) {
-                    let at = (y0 + k / across) * width + x0 + k % across;
-                    if let (Some(slot), Some(v)) = (samples.get_mut(n), pixels.get(at)) {
-                        *slot = f32::from(*v);
-                        n += 1;
+                let (whole_rows, rest) = (step / across, step % across);
+                let (mut x, mut y) = (0, 0);
+                for slot in &mut samples {
+                    let Some(v) = pixels.get((y0 + y) * width + x0 + x).filter(|_| y < down) else {
+                        break;
+                    };
+                    *slot = f32::from(*v);
+                    n += 1;
+                    // The next of the tile's pixels, counted row by row, that is `step` further.
+                    (x, y) = (x + rest, y + whole_rows);
+                    if x >= across {
+                        (x, y) = (x - across, y + 1);
                     }
                 }
                 let samples = &mut samples[..n];
@@ -95,34 +109,41 @@ impl Level {
     }
 
     fn fill(&mut self, y: usize) {
-        self.row.resize(self.width, 0.0);
-        let (above, below, v) = {
-            let last = (self.rows - 1) as f32;
-            let place = ((y as f32 + 0.5) / self.tile.1 - 0.5).clamp(0.0, last);
-            let low = (place as usize).min(self.rows.saturating_sub(2));
-            (low, (low + 1).min(self.rows - 1), place - low as f32)
-        };
-        let mut line = [0.0_f32; MOST];
-        for ((value, a), b) in line
-            .iter_mut()
-            .zip(&self.values[above])
-            .zip(&self.values[below])
-        {
-            *value = a + v * (b - a);
+        let last = (self.rows - 1) as f32;
+        let place = ((y as f32 + 0.5) / self.tile.1 - 0.5).clamp(0.0, last);
+        let upper = (place as usize).min(self.rows.saturating_sub(2));
+        if self.upper_tile != upper {
+            self.upper_tile = upper;
+            let [first, second] = [upper, (upper + 1).min(self.rows - 1)].map(|j| self.values[j]);
+            self.along(&first, |level| level.upper.as_mut());
+            let rises = std::array::from_fn(|i| second[i] - first[i]);
+            self.along(&rises, |level| level.rise.as_mut());
         }
-        // Straight from the middle of a tile to that of the next; level before the first and after the last.
-        let middle = |k: usize| (k as f32 + 0.5) * self.tile.0 - 0.5;
+        let share = place - upper as f32;
+        self.row.clear();
+        let parts = self.upper.iter().zip(&self.rise);
+        self.row
+            .extend(parts.map(|(level, rise)| level + share * rise));
+    }
+
+    /// Fills a line of pixels from values in the middles of tiles: straight from one middle to the next, level before the first and
+    /// after the last.
+    fn along(&mut self, values: &[f32; MOST], line: impl Fn(&mut Self) -> &mut Vec<f32>) {
+        let (tile_px, columns, width) = (self.tile.0, self.columns, self.width);
+        let line = line(self);
+        line.resize(width, 0.0);
+        let middle = |k: usize| (k as f32 + 0.5) * tile_px - 0.5;
         let mut done = 0;
-        for k in 0..=self.columns {
-            let end = if k < self.columns {
-                (middle(k).ceil().max(0.0) as usize).min(self.width)
+        for k in 0..=columns {
+            let end = if k < columns {
+                (middle(k).ceil().max(0.0) as usize).min(width)
             } else {
-                self.width
+                width
             };
-            let (left, right) = (k.saturating_sub(1), k.min(self.columns - 1));
-            let slope = (line[right] - line[left]) / self.tile.0;
-            let start = line[left] - slope * middle(left);
-            if let Some(part) = self.row.get_mut(done..end) {
+            let (left, right) = (k.saturating_sub(1), k.min(columns - 1));
+            let slope = (values[right] - values[left]) / tile_px;
+            let start = values[left] - slope * middle(left);
+            if let Some(part) = line.get_mut(done..end) {
                 let start = start + slope * done as f32;
                 for (n, value) in (0_i32..).zip(part) {
                     *value = start + slope * n as f32;

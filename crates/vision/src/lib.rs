@@ -28,6 +28,7 @@ pub mod cells;
 pub mod config;
 mod crop;
 mod detector;
+mod dust;
 mod fibre;
 mod fit;
 mod fix;

@@ -167,6 +167,11 @@ impl Residues {
         k
     }
 
+    /// Takes the mean all round a place of the window off what was put into `left`.
+    pub(crate) fn take_off_mean(&mut self, crop: &Crop, (x, y): (f32, f32)) {
+        take_off_radial_mean(crop, (x, y), self.left.as_mut_slice(), &mut self.rings);
+    }
+
     /// Mean square of what the template leaves besides its mean all round: a bead in another focus has none, whatever it has made of
     /// the profile, and it moves no bead; two beads, or a bead and something else, have.
     pub(crate) fn lopsided(

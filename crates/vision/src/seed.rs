@@ -8,6 +8,8 @@ const STATISTICS_PIXELS: usize = 1024;
 pub(crate) const LEAST_NOISE: f64 = 0.29;
 /// Side of the square whose sum is compared, px: one hot pixel is not a bead.
 pub(crate) const PATCH: usize = 3;
+/// Columns that are summed up together: their sums stay in the nearest cache.
+const COLUMNS: usize = 256;
 
 /// Centroid of the strongest bead of the frame; `sign` is -1 for dark cores. `None` when nothing stands out of the
 /// background by `min_snr` times its noise.
@@ -110,24 +112,24 @@ pub(crate) fn patch_sums<T: Copy>(pixels: &[T], width: usize, y: usize, sums: &m
 where
     f32: From<T>,
 {
-    let row = |k: usize| {
-        pixels
-            .get((y + k) * width..(y + k + 1) * width)
-            .unwrap_or(&[])
-    };
     sums.clear();
-    let columns = row(0).iter().zip(row(1)).zip(row(2));
-    sums.extend(columns.map(|((a, b), c)| f32::from(*a) + f32::from(*b) + f32::from(*c)));
-    add_neighbours(sums);
-}
-
-/// Replaces each value by its sum with the next two; the last two fall away.
-fn add_neighbours(sums: &mut Vec<f32>) {
-    let kept = sums.len().saturating_sub(PATCH - 1);
-    for k in 0..kept {
-        sums[k] += sums[k + 1] + sums[k + 2];
+    for first in (0..width.saturating_sub(PATCH - 1)).step_by(COLUMNS - 2) {
+        let end = (first + COLUMNS).min(width);
+        let row = |k: usize| {
+            pixels
+                .get((y + k) * width + first..(y + k) * width + end)
+                .unwrap_or(&[])
+        };
+        let mut columns = [0.0_f32; COLUMNS];
+        let three = row(0).iter().zip(row(1)).zip(row(2));
+        for (sum, ((a, b), c)) in columns.iter_mut().zip(three) {
+            *sum = f32::from(*a) + f32::from(*b) + f32::from(*c);
+        }
+        // Not in place: a sum that is read back from memory waits for the one before.
+        let columns = &columns[..end - first];
+        let three = columns.iter().zip(&columns[1..]).zip(&columns[2..]);
+        sums.extend(three.map(|((a, b), c)| a + b + c));
     }
-    sums.truncate(kept);
 }
 
 /// Largest sum over a patch, and the patch's centre; patches are `step` rows apart.
@@ -141,8 +143,6 @@ fn brightest_patch<T: Copy>(
 where
     f32: From<T>,
 {
-    /// Columns looked at together.
-    const COLUMNS: usize = 256;
     if width < PATCH || height < PATCH {
         return None;
     }

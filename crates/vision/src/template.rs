@@ -2,6 +2,7 @@
 
 use crate::profile::{GaussianProfile, RadialProfile, RingProfile, SplineProfile};
 use serde::{Deserialize, Serialize};
+use wide::f32x4;
 
 /// Values of a learnt profile.
 pub const TABLE_KNOTS: usize = 32;
@@ -69,6 +70,9 @@ pub enum PixelResponse {
 
 /// Entries of a [`Template`]: a power of two, so that masking an index replaces a bounds check.
 pub(crate) const TABLE_LEN: usize = 1024;
+
+/// From this number on, single precision holds whole numbers only.
+const TWO_TO_23: f32 = 8_388_608.0;
 
 /// One entry: value, its change per entry, derivative with respect to the squared radius, its change per entry.
 pub(crate) type Entry = [f32; 4];
@@ -159,7 +163,6 @@ impl Template {
     /// number into the low bits. Unlike a float-to-integer cast this is done for several pixels at once.
     #[inline(always)]
     pub(crate) fn place(&self, q_px2: f32) -> (u32, f32) {
-        const TWO_TO_23: f32 = 8_388_608.0;
         let u = (q_px2 * self.entries_per_px2).min((TABLE_LEN - 1) as f32);
         let shifted = u + TWO_TO_23;
         (shifted.to_bits(), u - (shifted - TWO_TO_23))
@@ -180,12 +183,31 @@ impl Template {
         self.read(self.place(q_px2))
     }
 
-    /// Sum of the second derivatives by the two directions at the squared radius `q_px2`, 1/px^2.
-    #[inline]
-    pub(crate) fn laplacian(&self, q_px2: f32) -> f32 {
-        let (entry, t) = self.place(q_px2);
-        let e = &self.table[entry as usize & (TABLE_LEN - 1)];
-        4.0 * self.slope_factor() * (e[2] + t * e[3] + q_px2 * self.entries_per_px2 * e[3])
+    /// Entries for four squared radii, number by number, and the distances to them: [`Template::place`] for four pixels.
+    #[inline(always)]
+    fn entries(&self, q_px2: f32x4) -> ([f32x4; 4], f32x4) {
+        let last = f32x4::splat((TABLE_LEN - 1) as f32);
+        let u = (q_px2 * f32x4::splat(self.entries_per_px2)).fast_min(last);
+        let shifted = u + f32x4::splat(TWO_TO_23);
+        let entry = |v: f32| f32x4::from(self.table[v.to_bits() as usize & (TABLE_LEN - 1)]);
+        let entries = shifted.to_array().map(entry);
+        let distance = u - (shifted - f32x4::splat(TWO_TO_23));
+        (f32x4::transpose(entries), distance)
+    }
+
+    /// [`Template::at`] for four squared radii.
+    #[inline(always)]
+    pub(crate) fn at_lanes(&self, q_px2: f32x4) -> (f32x4, f32x4) {
+        let (e, t) = self.entries(q_px2);
+        (e[0] + t * e[1], e[2] + t * e[3])
+    }
+
+    /// Sum of the second derivatives by the two directions at four squared radii, 1/px^2.
+    #[inline(always)]
+    pub(crate) fn laplacian(&self, q_px2: f32x4) -> f32x4 {
+        let (e, t) = self.entries(q_px2);
+        let bent = q_px2 * f32x4::splat(self.entries_per_px2) * e[3];
+        f32x4::splat(4.0 * self.slope_factor()) * (e[2] + t * e[3] + bent)
     }
 
     /// Normalised value at the squared radius `q_px2` (px^2).

@@ -34,6 +34,23 @@ impl Localiser {
         }
     }
 
+    /// Reads the noise of a window anew from which a speck's light was taken off.
+    pub(super) fn read_noise_beside(&mut self, f: &Fitted) {
+        if let PixelNoise::Estimated = self.config.noise {
+            let (variance, freedom) = self.noise_left_by(f);
+            self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
+            self.noise_variance = Some(self.noises.moderate(variance, self.noise_here.1));
+        }
+    }
+
+    /// Noise variance that the last windows had in common, grey^2; `None` if the noise is known or no window was seen.
+    pub(super) fn usual_noise(&self) -> Option<f64> {
+        match self.config.noise {
+            PixelNoise::Estimated => self.noises.common(),
+            PixelNoise::Known { .. } => None,
+        }
+    }
+
     /// Noise variance of a fit's residual along the border, and its degrees of freedom.
     fn noise_left_by(&self, f: &Fitted) -> (f64, f64) {
         let x = (f.x_px - self.crop.x0 as f64) as f32;

@@ -4,6 +4,7 @@ use super::judge::WIDENED_RATIO;
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
+use crate::dust::{self, Speck};
 use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
@@ -11,6 +12,10 @@ use crate::speckle;
 /// How often specks are searched in the residual of a fit: each time those at least half as strong as the strongest are left out.
 const MOST_LOOKS_FOR_SPECKS: usize = 5;
 
+/// Most specks beside a bead that are fitted.
+const MOST_SPECKS: usize = 2;
+/// Standard deviations of the sum of squares from which specks beside the bead are looked for.
+const LEAST_EXCESS: f64 = 3.0;
 /// Least share of a fit's excess residual that offsets of the lines must explain to count.
 const LEAST_OF_LINES: f64 = 0.5;
 
@@ -59,13 +64,14 @@ impl Localiser {
             fitted = self.fit(view, at, side_px, 0);
             left = fitted.as_ref().map(|f| self.left_by(f));
         }
-        let (f, l) = (
-            Fitted {
-                left: left?,
-                ..fitted?
-            },
-            left?,
-        );
+        let mut f = Fitted {
+            left: left?,
+            ..fitted?
+        };
+        if !view.is_draft && self.comb.is_still() {
+            f = self.without_specks(f, side_px);
+        }
+        let l = f.left;
         let level = f.pass.background + f64::from(self.crop.pedestal);
         // If the residual is wider or larger than noise, its score is, too.
         let asked = l.asks(self.pixel_variance(level) * self.widened.mean.max(1.0));
@@ -102,6 +108,89 @@ impl Localiser {
             left: self.left_by(&found),
             ..found
         })
+    }
+
+    /// The fit without the light of specks beside the bead, if what is left then is noise. Else the window is as it was: a wall or a
+    /// third speck is not explained by an ellipse, and bends it.
+    fn without_specks(&mut self, first: Fitted, side_px: usize) -> Fitted {
+        let mut specks = [None; MOST_SPECKS];
+        let mut last = None;
+        for slot in &mut specks {
+            let Some((found, speck)) = self.with_speck(last.as_ref().unwrap_or(&first)) else {
+                break;
+            };
+            (last, *slot) = (Some(found), Some(speck));
+        }
+        let Some(last) = last else {
+            return first;
+        };
+        if self.leaves_noise(&last) {
+            if side_px == self.config.window_px {
+                self.read_noise_beside(&last);
+            }
+            return last;
+        }
+        for speck in specks.iter().flatten() {
+            speck.put_back(&mut self.crop);
+        }
+        first
+    }
+
+    /// The fit of a bead together with a speck beside it, whose light is taken off the window, if a speck explains more than its price.
+    fn with_speck(&mut self, f: &Fitted) -> Option<(Fitted, Speck)> {
+        let variance = self.least_variance(f);
+        let own = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        let unit = self.weight_unit() * variance / own;
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        let before = f.pass.chi2 / unit;
+        // What chance leaves moves the bead by less than its own noise.
+        if before < pixels + LEAST_EXCESS * (2.0 * pixels).sqrt() {
+            return None;
+        }
+        let place = (f.x_px - self.crop.x0 as f64, f.y_px - self.crop.y0 as f64);
+        self.residues
+            .take_off_mean(&self.crop, (place.0 as f32, place.1 as f32));
+        let radius_px = self.template.radius_px();
+        let left = self.residues.left.as_slice();
+        let noise = variance.sqrt() as f32;
+        let first = Speck::seen(&self.crop, left, place, radius_px, noise)?;
+        let weights = self.weights(Some(&f.pass));
+        let at = (f.x_px, f.y_px);
+        let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
+        let other = f.left.explained_by_slope_and_size() / variance;
+        let after = both.pass.chi2 / unit;
+        if !dust::pays(&self.crop, radius_px, before, after, other) {
+            return None;
+        }
+        both.speck.take_off(&mut self.crop);
+        let (x_px, y_px) = both.place_px;
+        let found = Fitted {
+            x_px,
+            y_px,
+            pass: both.pass,
+            converged: f.converged,
+            slope: f.slope,
+            left: f.left,
+        };
+        let left = self.left_by(&found);
+        Some((Fitted { left, ..found }, both.speck))
+    }
+
+    /// Whether what a fit leaves is noise, besides its mean all round.
+    fn leaves_noise(&mut self, f: &Fitted) -> bool {
+        let variance = self.least_variance(f);
+        let at = (f.x_px, f.y_px);
+        let parts = (f.pass.amplitude, f.pass.background);
+        let left = self
+            .residues
+            .lopsided(&self.crop, &self.template, &self.comb, at, parts);
+        left <= WIDENED_RATIO * variance
+    }
+
+    /// Noise variance of a pixel at a fit's level, grey^2. A speck at the border counts as noise there: the last windows tell it better.
+    fn least_variance(&self, f: &Fitted) -> f64 {
+        let own = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        self.usual_noise().unwrap_or(own).min(own)
     }
 
     /// Widens a good fix's covariance by the offsets that rows and columns have had in the last fixes, and takes in this one's.

@@ -1,6 +1,7 @@
 //! Pictures, rendered and recorded, through localiser and trackers.
 
 mod beside_a_wall;
+mod beside_specks;
 mod bound;
 mod cell_lab;
 mod cell_table;
