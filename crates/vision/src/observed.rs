@@ -183,16 +183,7 @@ mod tests {
     /// over that of white noise, and the variance of the place over that from white noise.
     fn observed(sigma_px: f64, wide: usize) -> (f64, f64, f64) {
         const SIDE: usize = 21;
-        let mut state = 9_u64;
-        let mut normal = || {
-            (0..12).fold(-6.0, |sum, _| {
-                state ^= state >> 12;
-                state ^= state << 25;
-                state ^= state >> 27;
-                let bits = state.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11;
-                sum + bits as f64 / (1_u64 << 53) as f64
-            })
-        };
+        let mut random = cellpos_numeric::Random::new(9);
         let config = LocaliserConfig::new(ProfileSpec::Gaussian { sigma_px });
         let template = config.template().unwrap();
         let mut crop = Crop::new();
@@ -200,7 +191,7 @@ mod tests {
         for _ in 0..draws {
             let mut grey = vec![1000.0_f32; SIDE * SIDE];
             template.draw(&mut grey, SIDE, 10.0, 10.0, 400.0);
-            let noise: Vec<f64> = (0..SIDE * SIDE + wide).map(|_| normal()).collect();
+            let noise: Vec<f64> = (0..SIDE * SIDE + wide).map(|_| random.normal()).collect();
             let pixels: Vec<u16> = grey
                 .iter()
                 .zip(noise.windows(wide))

@@ -93,16 +93,12 @@ mod tests {
 
     /// Estimates of a variance with so many degrees of freedom.
     fn estimates(freedom: u32) -> impl FnMut(f64) -> f64 {
-        let mut state = 5_u64;
-        let mut uniform = move || {
-            state ^= state >> 12;
-            state ^= state << 25;
-            state ^= state >> 27;
-            (state.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
-        };
+        let mut random = cellpos_numeric::Random::new(5);
         // Two squares of normal numbers are an exponential one.
         move |variance| {
-            let sum: f64 = (0..freedom / 2).map(|_| -2.0 * uniform().ln()).sum();
+            let sum: f64 = (0..freedom / 2)
+                .map(|_| -2.0 * (1.0 - random.uniform()).ln())
+                .sum();
             variance * sum / f64::from(freedom)
         }
     }

@@ -392,21 +392,7 @@ pub(crate) fn basis(bin: usize, knots: usize) -> [(usize, f64); 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Normal numbers: xorshift64* and Box-Muller.
-    struct Random(u64);
-    impl Random {
-        fn uniform(&mut self) -> f64 {
-            self.0 ^= self.0 >> 12;
-            self.0 ^= self.0 << 25;
-            self.0 ^= self.0 >> 27;
-            (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64
-        }
-        fn normal(&mut self) -> f64 {
-            let r = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-            r * (core::f64::consts::TAU * self.uniform()).cos()
-        }
-    }
+    use cellpos_numeric::Random;
 
     fn collected(
         beads: usize,
@@ -431,7 +417,7 @@ mod tests {
 
     #[test]
     fn chance_confirms_no_deviation() {
-        let mut random = Random(4);
+        let mut random = Random::new(4);
         let gaussian = |r: f64| (-0.5 * r * r / 2.25).exp();
         let draws = 400;
         let confirmed = (0..draws)
@@ -446,7 +432,7 @@ mod tests {
 
     #[test]
     fn a_gaussian_in_noise_comes_back_as_that_gaussian() {
-        let mut random = Random(5);
+        let mut random = Random::new(5);
         for sigma_px in [0.8, 1.5, 4.0] {
             let gaussian = |r: f64| (-0.5 * (r / sigma_px) * (r / sigma_px)).exp();
             let rings = collected(20, 4.0 * sigma_px, 0.1, &mut random, gaussian);
@@ -459,7 +445,7 @@ mod tests {
 
     #[test]
     fn a_profile_of_its_own_kind_is_learnt_to_the_noise_and_stays_smooth() {
-        let mut random = Random(6);
+        let mut random = Random::new(6);
         let disc =
             |r: f64| 1.0 / (1.0 + ((r - 5.0) / 0.7).exp()) + 0.15 * (-(r - 8.0).powi(2)).exp();
         let rings = collected(20, 14.0, 0.1, &mut random, disc);

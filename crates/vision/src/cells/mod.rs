@@ -156,26 +156,12 @@ pub enum CellError {
 mod tests {
     use super::*;
     use crate::frame::{Frame, Pixels};
+    use cellpos_numeric::Random;
 
     const SIZE: (usize, usize) = (96, 48);
 
-    struct PixelNoise(u64);
-    impl PixelNoise {
-        fn next(&mut self) -> f64 {
-            let mut sum = 0.0;
-            for _ in 0..12 {
-                self.0 = self
-                    .0
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(1_442_695_040_888_963_407);
-                sum += (self.0 >> 11) as f64 / (1_u64 << 53) as f64;
-            }
-            sum - 6.0
-        }
-    }
-
     /// Uneven light, noise of 2 grey levels, and an elliptic cell with a dark rim when `cell` gives its centre.
-    fn picture(cell: Option<(f64, f64)>, light: f64, noise: &mut PixelNoise) -> Vec<u8> {
+    fn picture(cell: Option<(f64, f64)>, light: f64, noise: &mut Random) -> Vec<u8> {
         let pixel = |k: usize| {
             let (x, y) = ((k % SIZE.0) as f64, (k / SIZE.0) as f64);
             let mut v = 110.0 + 0.4 * x - 0.3 * y;
@@ -189,7 +175,7 @@ mod tests {
                     0.0
                 };
             }
-            (light * v + 2.0 * noise.next()).round().clamp(0.0, 255.0) as u8
+            (light * v + 2.0 * noise.normal()).round().clamp(0.0, 255.0) as u8
         };
         (0..SIZE.0 * SIZE.1).map(pixel).collect()
     }
@@ -202,7 +188,7 @@ mod tests {
         }
     }
 
-    fn taught(noise: &mut PixelNoise) -> CellFinder {
+    fn taught(noise: &mut Random) -> CellFinder {
         let mut finder = CellFinder::new(SIZE.0, SIZE.1, CellConfig::default()).unwrap();
         for _ in 0..20 {
             finder
@@ -214,7 +200,7 @@ mod tests {
 
     #[test]
     fn a_cell_gets_its_place_size_and_intensity_in_uneven_and_flickering_light() {
-        let mut noise = PixelNoise(4);
+        let mut noise = Random::new(4);
         let mut finder = taught(&mut noise);
         assert!(
             (finder.noise_grey() - 2.02).abs() < 0.1,
@@ -248,7 +234,7 @@ mod tests {
 
     #[test]
     fn an_empty_channel_has_no_cell() {
-        let mut noise = PixelNoise(5);
+        let mut noise = Random::new(5);
         let mut finder = taught(&mut noise);
         for light in [0.9, 1.0, 1.1] {
             let pixels = picture(None, light, &mut noise);
@@ -258,7 +244,7 @@ mod tests {
 
     #[test]
     fn a_frame_of_another_size_a_short_one_and_a_missing_background_are_errors() {
-        let mut noise = PixelNoise(6);
+        let mut noise = Random::new(6);
         let pixels = picture(None, 1.0, &mut noise);
         let mut finder = CellFinder::new(SIZE.0, SIZE.1, CellConfig::default()).unwrap();
         assert_eq!(finder.find(&frame(&pixels)), Err(CellError::NoBackground));

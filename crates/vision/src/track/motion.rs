@@ -376,19 +376,13 @@ mod tests {
             flow_error: 0.0,
         };
         let mut motion = Motion::new(&fix(0.0));
-        let (mut state, mut x, mut y, mut sum) = (9_u64, 0.0, 5.0, 0.0);
-        let mut uniform = move || {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
-        };
+        let (mut x, mut y, mut sum) = (0.0, 5.0, 0.0);
+        let mut random = cellpos_numeric::Random::new(9);
         let n = 20_000;
         for k in 0..n {
-            // Uniform steps of variance 2 D dt.
-            let width = (12.0 * 2.0 * 30.0 * 1e-3_f64).sqrt();
-            x += width * uniform();
-            y += width * uniform();
+            let step = (2.0 * 30.0 * 1e-3_f64).sqrt();
+            x += step * random.normal();
+            y += step * random.normal();
             motion.predict(1e-3, (0.0, 0.0), &randomness);
             let f = Fix { y_px: y, ..fix(x) };
             if k >= 1000 {
