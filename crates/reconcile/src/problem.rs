@@ -1,12 +1,14 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
 use crate::data::flow_estimate;
+use crate::data::flow_loss::FlowLoss;
 use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
-use crate::data::noise::{NoiseModel, Whitener};
+use crate::data::noise::NoiseModel;
 use crate::data::record::{Record, command_range_um};
 use crate::data::uncertain::{anywhere_at, uncertain_command};
 use crate::data::waits::waits;
+use crate::data::whitener::Whitener;
 use crate::dot::dot;
 use crate::model_error::STEP;
 use crate::simulate::{Base, Effect, Input, Sampling, simulate};
@@ -408,6 +410,12 @@ impl Problem {
             r.set_noise(&self.noise);
         }
         self
+    }
+
+    /// Loss of a zero flow in the chip, by the effects of the model and further ones.
+    pub(crate) fn flow_loss(&self, effects: &[Effect]) -> Option<FlowLoss> {
+        let own = self.errors.0.first().map_or(&[][..], |(_, own)| own);
+        FlowLoss::of(&[own, effects].concat(), self.base.sample_s)
     }
 
     /// The same problem with the zero flow where the residuals of a fit say that it was.

@@ -4,7 +4,8 @@
 //! A walk in its stead would swallow every slow error of a model of a static sensor; white noise alone would call the slow noise
 //! an error. Not for lines: a line is no noise, and a fit that leaves one is refused.
 
-use crate::data::noise::{Coloured, NoiseModel, Whitener};
+use crate::data::noise::{Coloured, NoiseModel};
+use crate::data::whitener::Whitener;
 use cellpos_numeric::fft;
 
 /// Which noise the records are taken to have.

@@ -5,7 +5,8 @@
 
 use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
-use crate::data::noise::{NoiseModel, Whitener};
+use crate::data::noise::NoiseModel;
+use crate::data::whitener::Whitener;
 use crate::dot::dot;
 
 /// Mean motion of the bead in every row \[um\] that a noise's zero flow makes, given a residual \[um\]; empty without such a flow.
@@ -34,6 +35,9 @@ pub(crate) fn motion_um(
     for (m, x) in motion.iter_mut().zip(&x).rev() {
         *m = z.motion_um2 * later;
         later += x;
+    }
+    if let Some(chip) = z.loss {
+        chip.transpose(&mut motion);
     }
     correlate(&mut motion, z.keep());
     let middle = 0.5 * (rows as f64 - 1.0);
@@ -89,6 +93,7 @@ mod tests {
                 motion_um2: 4e-6,
                 time_rows: 4000.0,
                 drift_um: 1e-6,
+                loss: None,
             }),
             ..NoiseModel::new(0.33, 1e-3, 0.030)
         }

@@ -2,7 +2,8 @@
 //! drift, an error of the model.
 
 use crate::data::motion::FlowPaths;
-use crate::data::noise::{NoiseModel, Whitener};
+use crate::data::noise::NoiseModel;
+use crate::data::whitener::Whitener;
 use crate::dot::dot;
 use nalgebra::{DMatrix, SymmetricEigen};
 
@@ -145,6 +146,7 @@ mod tests {
                 motion_um2: 1e-12,
                 time_rows: 10.0,
                 drift_um: 0.05,
+                loss: None,
             }),
             ..NoiseModel::new(0.33, 1e-3, 0.0)
         };

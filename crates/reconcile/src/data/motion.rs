@@ -1,5 +1,7 @@
 //! What a zero flow that moves does to the bead.
 
+use crate::data::flow_loss::FlowLoss;
+
 /// The velocity that a zero flow gives to the bead: a first-order Gauss-Markov process about that of the working point. A time longer
 /// than the records is a walk, and with a large variance an offset.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
@@ -10,6 +12,9 @@ pub struct ZeroFlow {
     pub time_rows: f64,
     /// Standard deviation of a steady change of the motion from row to row, different in each record \[um\].
     pub drift_um: f64,
+    /// Its loss in the chip, if it enters ahead of that.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub loss: Option<FlowLoss>,
 }
 
 impl ZeroFlow {

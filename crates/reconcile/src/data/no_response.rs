@@ -5,8 +5,9 @@
 //! the model is off. A nonlinear one stays and adds to them; it takes nothing away.
 
 use crate::data::cleaned::increment_moments;
-use crate::data::noise::{NoiseModel, Whitener};
+use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
+use crate::data::whitener::Whitener;
 use crate::dot::dot;
 use crate::thresholds::THRESHOLDS;
 use nalgebra::{DMatrix, DVector};

@@ -41,6 +41,7 @@ impl Prior {
             motion_um2: (displacement_um * self.motion_per_um).powi(2),
             time_rows: TIME_S.0 * (TIME_S.1 * time).exp() / self.sample_s,
             drift_um: DRIFT_UM_PER_S * self.sample_s * self.motion_per_um,
+            loss: None,
         }
     }
 
@@ -56,7 +57,10 @@ impl Prior {
 
     fn noise_at(&self, noise: &NoiseModel, x: [f64; 2]) -> NoiseModel {
         NoiseModel {
-            zero_flow: Some(self.at(x)),
+            zero_flow: Some(ZeroFlow {
+                loss: noise.zero_flow.and_then(|z| z.loss),
+                ..self.at(x)
+            }),
             ..*noise
         }
     }
@@ -133,7 +137,7 @@ mod tests {
     use super::*;
     use crate::data::free::Free;
     use crate::data::motion::FlowPaths;
-    use crate::data::noise::Whitener;
+    use crate::data::whitener::Whitener;
     use crate::dot::dot;
 
     fn normal(state: &mut u64) -> f64 {

@@ -291,7 +291,7 @@ mod tests {
         let t = track(&noise, 0.0, 0.25, 3000);
         let grid = Grid::new(&noise, [0.0; 2], 0.25).unwrap();
         let rows = grid.rows(&t, [0.0; 2], 0.25);
-        let w = crate::data::noise::Whitener::new(&noise, &t.present, None);
+        let w = crate::data::whitener::Whitener::new(&noise, &t.present, None);
         let mut e = vec![0.0; 3000];
         w.apply(&t.seen_um, &mut e);
         // The constants cancel between rows of the steady state.

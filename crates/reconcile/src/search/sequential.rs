@@ -13,7 +13,7 @@ use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
 
 /// Sums of squares this far above that of a fit decide nothing, whatever their prices.
-fn within(fit: &Fit) -> f64 {
+pub(crate) fn within(fit: &Fit) -> f64 {
     100.0 + THRESHOLDS.untypical_share * left_over(fit)
 }
 

@@ -2,6 +2,7 @@
 
 use crate::data::coloured::NoiseKind;
 use crate::data::floor::{Floor, error_of, refined};
+use crate::data::flow_loss::FlowLoss;
 use crate::data::noise::NoiseModel;
 use crate::data::zero_flow::Prior;
 use crate::fit::catalogue::{self, Part};
@@ -10,7 +11,7 @@ use crate::problem::Problem;
 use crate::search::cost::{penalised_cost, threshold_of};
 use crate::search::effort::Effort;
 use crate::search::found::Found;
-use crate::search::sequential::search;
+use crate::search::sequential::{search, within};
 use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
@@ -178,7 +179,10 @@ impl Searching<'_> {
             if moving.found.cut_short {
                 return moving;
             }
-            let weighed = self.with_zero_flow(&moving.problem, &moving.found.fit);
+            let mut weighed = self.with_zero_flow(&moving.problem, &moving.found.fit);
+            if let Some(exchanged) = self.weigh_rivals(&mut moving, &weighed) {
+                weighed = exchanged;
+            }
             if weighed.cost > self.cost(&moving.problem, &moving.found.fit) - SETTLED {
                 break;
             }
@@ -213,6 +217,36 @@ impl Searching<'_> {
         }
     }
 
+    /// Weighs the rivals of a set, each under the noise that it leaves itself: the model's stated error acts beside it, and it leaves another
+    /// zero flow. `own` is the set under its noise. The best set with a rival in it that is more probable than `own`.
+    ///
+    /// Under the noise of the set a rival has to explain what that noise takes up.
+    fn weigh_rivals(&self, searched: &mut Searched, own: &Weighed) -> Option<Weighed> {
+        let Searched { found, problem } = searched;
+        let unpriced = |w: &Weighed| w.cost - self.prices(&w.problem, &w.fit);
+        let (here, reach) = (unpriced(own), within(&found.fit));
+        let mut best: Option<Weighed> = None;
+        for (place, rivals) in found.rivals.iter_mut().enumerate() {
+            let id = found.fit.parts[place].id();
+            for rival in rivals {
+                if rival.id == id || rival.chi2 - found.fit.chi2 > reach {
+                    continue;
+                }
+                let mut parts = found.fit.parts.clone();
+                parts[place] = rival.part.clone();
+                let ctx = self.context(problem, 0);
+                let fit = ctx.fit_from(parts, Some(found.fit.soft), &problem.all(), 8);
+                let weighed = self.with_zero_flow(problem, &fit);
+                rival.chi2 = found.fit.chi2 + unpriced(&weighed) - here;
+                rival.part = weighed.fit.parts[place].clone();
+                if weighed.cost < best.as_ref().unwrap_or(own).cost {
+                    best = Some(weighed);
+                }
+            }
+        }
+        best
+    }
+
     /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow. The model's
     /// stated error acts beside the set.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
@@ -228,10 +262,22 @@ impl Searching<'_> {
             }
         };
         let left = residual(problem, fit);
-        let problem = problem.clone().beside(&self.effects(fit));
-        let noise =
-            prior_of(&problem).estimate(&problem.noise, |noise| problem.unlikelihood(noise, &left));
-        let mut best = weighed(problem.with_noise(noise), fit);
+        let effects = self.effects(fit);
+        let problem = problem.clone().beside(&effects);
+        let estimate = |loss: Option<FlowLoss>| {
+            let begun = problem.noise.with_loss(loss);
+            let noise =
+                prior_of(&problem).estimate(&begun, |noise| problem.unlikelihood(noise, &left));
+            weighed(problem.clone().with_noise(noise), fit)
+        };
+        // A zero flow ahead of the chip passes through it, one behind it does not. Before the records are seen both are as likely.
+        let mut best = estimate(None);
+        if let Some(loss) = problem.flow_loss(&effects) {
+            let ahead = estimate(Some(loss));
+            if ahead.cost < best.cost {
+                best = ahead;
+            }
+        }
         for _ in 0..MOST_PATHS {
             let left = residual(&best.problem, &best.fit);
             let next = weighed(best.problem.clone().with_flow(&left), &best.fit);
@@ -243,20 +289,25 @@ impl Searching<'_> {
         best
     }
 
-    /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the zero flow and, for each part,
-    /// what any addition must gain.
+    /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the zero flow and of the set.
     fn cost(&self, problem: &Problem, fit: &Fit) -> f64 {
-        let records = problem.records.len();
         let (residual, _) = self.context(problem, 0).residual(fit);
-        let dearer = |p: &Part| {
-            threshold_of(p.variant(), records) - NUMBER * freedom_of(p.variant(), records) as f64
-        };
-        penalised_cost(&self.context(problem, 0), fit)
-            + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
+        fit.chi2
+            + self.prices(problem, fit)
             + problem.log_determinant()
             + prior_of(problem).price(&problem.noise, |noise| {
                 problem.unlikelihood(noise, &residual)
             })
+    }
+
+    /// The prices of a set: those of a search and, for each part, what any addition must gain.
+    fn prices(&self, problem: &Problem, fit: &Fit) -> f64 {
+        let records = problem.records.len();
+        let dearer = |p: &Part| {
+            threshold_of(p.variant(), records) - NUMBER * freedom_of(p.variant(), records) as f64
+        };
+        penalised_cost(&self.context(problem, 0), fit) - fit.chi2
+            + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
     }
 }
 

@@ -256,6 +256,7 @@ fn beside_any_flow(searching: &Searching<'_>, problem: &Problem) -> Problem {
             motion_um2: motion_um * motion_um,
             time_rows: searching.scope.length_s / base.sample_s,
             drift_um: 0.0,
+            loss: None,
         }),
         coloured: None,
         ..problem.noise

@@ -26,6 +26,8 @@ pub(super) enum Hidden {
     Gain(f64),
     /// Corner \[rad/s\].
     Leak(f64),
+    /// The same, with the zero flow ahead of it.
+    LeakAfterFlow(f64),
     /// Ends of the range \[um\].
     Clip(f64, f64),
     /// Share of the stroke, by Dahl's equation, and the motion after which it has turned \[um\].
@@ -78,7 +80,7 @@ impl Hidden {
         match self {
             Self::Nothing => ("", vec![]),
             Self::Gain(f) => ("gain-error", vec![("factor", f)]),
-            Self::Leak(w) => ("leak", vec![("corner_rad_per_s", w)]),
+            Self::Leak(w) | Self::LeakAfterFlow(w) => ("leak", vec![("corner_rad_per_s", w)]),
             Self::Clip(low, high) => ("saturation", vec![("low_um", low), ("high_um", high)]),
             Self::Dahl(share, _) => ("pzt-hysteresis", vec![("fraction", share)]),
             Self::Plays(_) => ("pzt-hysteresis", vec![]),
@@ -157,7 +159,9 @@ impl Chain {
                 s[2] = share * swung(s, u, TAU * hz, damping, h).1;
                 u
             }
-            Hidden::Leak(corner) => u - lagged(&mut s[0], u, h * corner),
+            Hidden::Leak(corner) | Hidden::LeakAfterFlow(corner) => {
+                u - lagged(&mut s[0], u, h * corner)
+            }
             Hidden::Clip(low, high) => u.clamp(low - WORKING_POINT_UM, high - WORKING_POINT_UM),
             Hidden::Dahl(share, turn_um) => {
                 s[0] += moved / turn_um * (1.0 - moved.signum() * s[0]);
@@ -326,7 +330,11 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
         let zero = wander + flow.drift_um_per_s * now_s + pumped_um;
         let mut position = 0.0;
         for i in 0..STEPS_A_ROW {
-            let input = chain.advance(commands[k * STEPS_A_ROW + i], step_s) - zero;
+            let command = commands[k * STEPS_A_ROW + i];
+            let input = match hidden {
+                Hidden::LeakAfterFlow(_) => chain.advance(command - zero, step_s),
+                _ => chain.advance(command, step_s) - zero,
+            };
             let free = rest[0] * x[1] + rest[1] * x[0] + direct * input;
             if let Hidden::Adhesion(least) = hidden {
                 // A jump is faster than any speed that sticks.
