@@ -203,25 +203,16 @@ pub(crate) fn choose(kind: NoiseKind, walk: NoiseModel, alone: &Alone<'_>) -> No
 mod tests {
     use super::*;
 
-    fn normal(state: &mut u64) -> f64 {
-        let mut uniform = || {
-            *state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (*state >> 11) as f64 / (1u64 << 53) as f64
-        };
-        (0..12).map(|_| uniform()).sum::<f64>() - 6.0
-    }
-
     /// Coloured noise of a variance and a time, white noise of 1, a walk, and a line, the same each time.
-    fn series(n: usize, [variance, rows, walk, line]: [f64; 4], mut state: u64) -> Vec<f64> {
+    fn series(n: usize, [variance, rows, walk, line]: [f64; 4], seed: u64) -> Vec<f64> {
+        let mut random = cellpos_numeric::Random::new(seed);
         let keep = (-1.0 / rows).exp();
-        let (mut c, mut m) = (variance.sqrt() * normal(&mut state), 0.0);
+        let (mut c, mut m) = (variance.sqrt() * random.normal(), 0.0);
         (0..n)
             .map(|k| {
-                c = keep * c + (variance * (1.0 - keep * keep)).sqrt() * normal(&mut state);
-                m += walk.sqrt() * normal(&mut state);
-                7.0 + m + c + normal(&mut state) + line * (0.23 * k as f64).sin()
+                c = keep * c + (variance * (1.0 - keep * keep)).sqrt() * random.normal();
+                m += walk.sqrt() * random.normal();
+                7.0 + m + c + random.normal() + line * (0.23 * k as f64).sin()
             })
             .collect()
     }

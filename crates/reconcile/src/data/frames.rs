@@ -201,13 +201,10 @@ mod tests {
     #[test]
     fn rows_that_are_alike_because_of_six_digits_in_all_are_no_repeats_of_a_camera() {
         // A ramp to 900 with noise of 0.05, as other programs write it.
-        let mut noise = 1u64;
+        let mut random = cellpos_numeric::Random::new(1);
         let y: Vec<f64> = (0..60_000)
             .map(|k| {
-                noise = noise
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(1_442_695_040_888_963_407);
-                let chance = (noise >> 33) as f64 / f64::from(u32::MAX >> 1) - 0.5;
+                let chance = random.uniform() - 0.5;
                 let value: f64 = 0.015 * f64::from(k) + 0.1 * chance;
                 format!("{value:.5e}").parse().unwrap()
             })
@@ -232,13 +229,8 @@ mod tests {
 
     /// A random walk in which the rows that `repeats` says are those before them.
     fn walk(rows: usize, repeats: impl Fn(usize, f64) -> bool) -> Record {
-        let mut noise = 11u64;
-        let mut chance = || {
-            noise = noise
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            (noise >> 33) as f64 / f64::from(u32::MAX >> 1)
-        };
+        let mut random = cellpos_numeric::Random::new(11);
+        let mut chance = || random.uniform();
         let (mut y, mut x) = (vec![0.0; rows], 0.0);
         for k in 1..rows {
             x += 0.1 * (chance() - 0.5);
@@ -268,13 +260,10 @@ mod tests {
     #[test]
     fn the_rate_of_repeats_is_right_of_a_bead_that_crosses_zero() {
         // A bead about zero, in fine steps. Few rows are of any one small size, and their least increment is no step.
-        let mut noise = 5u64;
+        let mut random = cellpos_numeric::Random::new(5);
         let mut y: Vec<f64> = (0..20_000)
             .map(|k| {
-                noise = noise
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(1_442_695_040_888_963_407);
-                let chance = (noise >> 33) as f64 / f64::from(u32::MAX >> 1) - 0.5;
+                let chance = random.uniform() - 0.5;
                 let value = 0.3 * (1e-3 * f64::from(k)).sin() + 0.2 * chance;
                 (value * 1e6).round() * 1e-6
             })

@@ -140,28 +140,18 @@ mod tests {
     use crate::data::whitener::Whitener;
     use crate::dot::dot;
 
-    fn normal(state: &mut u64) -> f64 {
-        let mut uniform = || {
-            *state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (*state >> 11) as f64 / (1u64 << 53) as f64
-        };
-        (0..12).map(|_| uniform()).sum::<f64>() - 6.0
-    }
-
     /// A bead of the nominal rig over a zero flow of a motion a row (RMS) and a time, or of a steady change.
     fn series(rows: usize, motion_um: f64, time_rows: f64, drift: f64, seed: u64) -> Vec<f64> {
         let n = NoiseModel::new(0.33, 1e-3, 0.030);
-        let mut state = seed;
+        let mut random = cellpos_numeric::Random::new(seed);
         let keep = (-1.0 / time_rows).exp();
-        let mut v = motion_um * normal(&mut state);
+        let mut v = motion_um * random.normal();
         let mut m = 0.0;
         (0..rows)
             .map(|k| {
-                m += v + drift * k as f64 + n.walk_um2.sqrt() * normal(&mut state);
-                v = keep * v + (1.0 - keep * keep).sqrt() * motion_um * normal(&mut state);
-                m + n.white_um2.sqrt() * normal(&mut state)
+                m += v + drift * k as f64 + n.walk_um2.sqrt() * random.normal();
+                v = keep * v + (1.0 - keep * keep).sqrt() * motion_um * random.normal();
+                m + n.white_um2.sqrt() * random.normal()
             })
             .collect()
     }

@@ -260,14 +260,8 @@ mod tests {
 
     /// A walk seen with noise through an error of known size.
     fn track(noise: &NoiseModel, amplitude_um: f64, pixel_um: f64, rows: usize) -> Track {
-        let mut state = 0x2545_F491_4F6C_DD1D_u64;
-        let mut uniform = || {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
-            (state >> 11) as f64 / (1u64 << 53) as f64
-        };
-        let mut normal = || (-2.0 * uniform().max(1e-300).ln()).sqrt() * (TAU * uniform()).cos();
+        let mut random = cellpos_numeric::Random::new(1);
+        let mut normal = || random.normal();
         let path_um: Vec<f64> = (0..rows).map(|k| 2.0 * (0.013 * k as f64).sin()).collect();
         let mut walk = 0.0;
         let seen_um = path_um
