@@ -273,7 +273,7 @@ mod tests {
             assert!(supported.is_none(), "seed {seed}: {supported:?}");
             let mean =
                 ratios.iter().map(|ratio| ratio.coherence).sum::<f64>() / ratios.len() as f64;
-            assert!(mean < 0.1, "seed {seed}: {mean}");
+            assert!(mean < 0.2, "seed {seed}: {mean}");
         }
     }
 
