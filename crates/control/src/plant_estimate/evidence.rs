@@ -12,6 +12,8 @@ use super::motion::{BLOCK, Frame, MEMBERS};
 /// variance of the products is then known to 6 %.
 pub(super) const MEMORY_FIXES: f64 = 2048.0;
 const MEMORY: f64 = MEMORY_FIXES / BLOCK as f64;
+/// Standard deviations from which on less is taken of a fix (Huber).
+pub(super) const FAR: f64 = 3.0;
 /// Standard deviation of the commanded motion over the chosen motion, a lag, before it was seen. The loop leaves the dither alone, so it
 /// answers what a wrong gain makes of it only: half of that in a tick, and the gain is wrong by half.
 const ANSWER: f64 = 0.25;

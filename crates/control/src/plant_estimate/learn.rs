@@ -1,14 +1,12 @@
 //! A fix enters the estimate.
 
-use super::evidence::{Products, dot};
+use super::evidence::{FAR, Products, dot};
 use super::motion::{Alignment, MEMBERS};
 use super::retuning::DELAYS;
 use super::whiten::Whitener;
 use super::{AdaptState, Adapter, age_ticks};
 use crate::estimator::Fix;
 
-/// Standard deviations from which on less is taken of a fix (Huber).
-pub(super) const FAR: f64 = 3.0;
 /// Memory of the motion of the loop's own commands and of what they leave, fixes: three periods of the ringing that a gain that doubled
 /// makes.
 const NOW_FIXES: f64 = 60.0;

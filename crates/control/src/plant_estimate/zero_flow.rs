@@ -5,8 +5,7 @@
 //! others. The likelihood of a walk is that mean square to the power of `-n/2`, for the `n` fixes of the memory. A flow that forgets
 //! itself within some time (Ornstein-Uhlenbeck) is a walk to a filter that follows it within less.
 
-use super::evidence::{MEMORY_FIXES, part};
-use super::learn::FAR;
+use super::evidence::{FAR, MEMORY_FIXES, part};
 use super::whiten::{Correction, Covariance, Track, Whitener};
 use crate::error::BuildError;
 use crate::estimator::{EstimatorConfig, Fix};
