@@ -4,9 +4,11 @@
 use crate::experiment::again::Again;
 use crate::experiment::excitation::Experiment;
 use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
+use crate::experiment::rows::Rows;
 use cellpos_ident::experiment::Plan;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
+use cellpos_runtime::TickRecord;
 use cellpos_session::Failure;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -216,6 +218,22 @@ fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Fai
     record.frame_age_s.clone_from(&acquired.frame_age_s);
     record.late_command.clone_from(&acquired.late_command);
     record.exposure_s = acquired.exposure_s;
+    Ok(record)
+}
+
+/// The ticks of a run with a closed loop as a record, row by row of the camera: a tick that is early or late, or never comes, moves no row. A
+/// stall leaves open when the board had the commands of its rows.
+///
+/// # Errors
+/// Ticks that are no record, with what a record needs.
+pub fn of_ticks(name: &str, ticks: &[TickRecord], period_s: f64) -> Result<Record, Failure> {
+    let rows = Rows::of(ticks, (period_s * 1e9).round() as i64);
+    let time_s: Vec<f64> = (0..rows.input.len()).map(|k| k as f64 * period_s).collect();
+    let mut record =
+        Record::from_rows(name, &time_s, &rows.input, &rows.delivered_um()).map_err(refused)?;
+    record.frame_age_s = rows.frame_age_s();
+    record.unseen = rows.unseen;
+    record.late_command = rows.stalled;
     Ok(record)
 }
 

@@ -8,9 +8,6 @@ use crate::experiment::exciting::Handing;
 use crate::experiment::identify::held_bead::Setup;
 use crate::experiment::identify::led::{DelayTest, dithered_trips, switch};
 use crate::experiment::rows::{Rows, ended_spans, fix_noise_um};
-pub use crate::experiment::rows::{
-    frame_age_ns, frames_passed_over, is_unseen, repeat_before, repeats_picture,
-};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;

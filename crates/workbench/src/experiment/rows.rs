@@ -21,25 +21,25 @@ pub(crate) fn fix_noise_um(ticks: &[TickRecord]) -> Option<f64> {
 }
 
 /// Whether a frame came at this tick but showed no reliable bead.
-pub fn is_unseen(tick: &TickRecord) -> bool {
+fn is_unseen(tick: &TickRecord) -> bool {
     let came = tick.verdict != 255 && !tick.flags.has(TickFlags::TIMER);
     came && !tick.measured_um.is_finite()
 }
 
 /// Whether a tick's frame, new by its id, shows the picture before it, pixel by pixel: the camera delivered one twice.
-pub fn repeats_picture(tick: &TickRecord) -> bool {
+fn repeats_picture(tick: &TickRecord) -> bool {
     is_unseen(tick) && tick.decision == Decision::Stale as u8
 }
 
 /// Gives a row whose frame repeats the picture before it the position before it, so that repeats can be counted.
-pub fn repeat_before(bead_um: &mut [f64], row: usize) {
+fn repeat_before(bead_um: &mut [f64], row: usize) {
     if row > 0 && row < bead_um.len() {
         bead_um[row] = bead_um[row - 1];
     }
 }
 
 /// Frames that arrived together with a tick's frame and were not used: late, for example after a stall of the camera, but not dropped.
-pub fn frames_passed_over(tick: &TickRecord) -> usize {
+fn frames_passed_over(tick: &TickRecord) -> usize {
     match is_new_frame(tick) {
         true => usize::from(tick.drained).saturating_sub(1),
         false => 0,
@@ -80,11 +80,6 @@ pub(crate) struct Rows {
     usual_age_periods: f64,
     /// Row of each tick since the loop was closed.
     of_tick: Vec<usize>,
-}
-
-/// How old the frame of a tick is, by its own stamp, ns; `None` for a tick without a new frame.
-pub fn frame_age_ns(tick: &TickRecord) -> Option<i64> {
-    is_new_frame(tick).then(|| age_ns(tick))
 }
 
 /// Mean of the known ages, s.

@@ -357,3 +357,28 @@ fn a_short_freeze_is_a_gap_in_a_segment_and_a_long_one_spoils_it() {
         assert!(missing.is_ok_and(|missing| missing == rows) == is_whole);
     }
 }
+
+/// A tick that never came leaves its frame's row without a position and its motion open. It shifts no other row.
+#[test]
+fn a_run_with_skipped_ticks_is_a_record_by_its_frames() {
+    let late = Lateness {
+        skipped: 0.02,
+        ..CALM
+    };
+    let ticks = ticks(7.0, 2000, &late);
+    let record = crate::experiment::collect::of_ticks("run", &ticks, 1e-3).unwrap();
+    let closed: Vec<&TickRecord> = ticks.iter().filter(|tick| tick.is_running()).collect();
+    let row = |tick: &TickRecord| (tick.frame_id - closed[0].frame_id) as usize;
+    let mut skipped = 0;
+    for pair in closed.windows(2) {
+        let (before, at) = (row(pair[0]), row(pair[1]));
+        assert_eq!(record.pzt_um[at], pair[1].command_um, "row {at}");
+        for missing in before + 1..at {
+            skipped += 1;
+            assert!(record.late_command[missing], "row {missing}");
+            assert!(record.bead_um[missing].is_nan(), "row {missing}");
+        }
+    }
+    assert!(skipped > 20, "{skipped}");
+    assert_eq!(record.rows(), row(closed[closed.len() - 1]) + 1);
+}

@@ -7,10 +7,7 @@ use cellpos_reconcile::Record;
 use cellpos_record::{RunMeta, RunReader};
 use cellpos_runtime::TickRecord;
 use cellpos_session::sessions;
-use cellpos_workbench::experiment::collect::{neutral_um, record_name, refused};
-use cellpos_workbench::experiment::on_rig::{
-    frame_age_ns, frames_passed_over, is_unseen, repeat_before, repeats_picture,
-};
+use cellpos_workbench::experiment::collect::{neutral_um, of_ticks, record_name, refused};
 use cellpos_workbench::foreign::columns::{self, Wanted};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -146,38 +143,23 @@ pub(super) fn read(path: &Path, columns: &Columns, held: bool) -> Result<Record,
 /// A run folder, of an open or a closed loop: the commands given, and the positions as the camera delivered them; and where
 /// its bead rested.
 pub(super) fn read_run(path: &Path, run: &RunReader) -> Result<(Record, Option<f64>), Failure> {
-    let record = run.to_record().map_err(Failure::input)?;
-    let time_s: Vec<f64> = (0..record.len())
-        .map(|k| record.start_s + k as f64 * record.step_s)
-        .collect();
-    let mut read = Record::from_rows(&record_name(path), &time_s, &record.pzt_um, &record.bead_um)
-        .map_err(refused)?;
-    read.frame_age_s = vec![f64::NAN; read.rows()];
+    let whole = run.to_record().map_err(Failure::input)?;
+    let ticks: Vec<TickRecord> = run.batches().map_err(Failure::input)?.flatten().collect();
+    let mut read = if ticks.iter().any(TickRecord::is_running) {
+        of_ticks(&record_name(path), &ticks, whole.step_s)?
+    } else {
+        let time_s: Vec<f64> = (0..whole.len())
+            .map(|k| whole.start_s + k as f64 * whole.step_s)
+            .collect();
+        Record::from_rows(&record_name(path), &time_s, &whole.pzt_um, &whole.bead_um)
+            .map_err(refused)?
+    };
     read.exposure_s = run.meta().map_or(0.0, exposure_s);
-    let mut first_seq = None;
     // Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
-    let (mut sum_um, mut count) = (0.0, 0_usize);
-    for tick in run.batches().map_err(Failure::input)?.flatten() {
-        let first_seq = *first_seq.get_or_insert(tick.seq);
-        let row = usize::try_from(tick.seq.saturating_sub(first_seq)).unwrap_or(usize::MAX);
-        // The frames passed over, and its own.
-        let came =
-            row.saturating_sub(frames_passed_over(&tick))..row + usize::from(is_unseen(&tick));
-        if let Some(unseen) = read.unseen.get_mut(came) {
-            unseen.fill(true);
-        }
-        if repeats_picture(&tick) {
-            repeat_before(&mut read.bead_um, row);
-        }
-        if let Some(age_ns) = frame_age_ns(&tick)
-            && let Some(age_s) = read.frame_age_s.get_mut(row)
-        {
-            *age_s = 1e-9 * age_ns as f64;
-        }
-        if held(&tick) {
-            (sum_um, count) = (sum_um + tick.command_um, count + 1);
-        }
-    }
+    let held = ticks.iter().filter(|tick| held(tick));
+    let (sum_um, count) = held.fold((0.0, 0_usize), |(sum, count), tick| {
+        (sum + tick.command_um, count + 1)
+    });
     // Ten seconds of a held bead move it by less than 10 um: 2 nm of PZT.
     Ok((read, (count >= 1000).then(|| sum_um / count as f64)))
 }
