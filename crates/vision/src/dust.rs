@@ -7,6 +7,7 @@
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::{FIRST_COLUMNS, Image, Pass, Weights};
 use crate::fix::squared;
+use crate::least_squares::{self, four};
 use crate::streak::Comb;
 use crate::template::Template;
 use nalgebra::{SMatrix, SVector};
@@ -291,8 +292,7 @@ impl Sums {
         let lanes_end = crop.lanes_end();
         let mut image = Image::new(lanes_end);
         let mut weight = weights.of_even(crop);
-        let (mut normal, mut right) = ([[f32x4::ZERO; ALL]; ALL], [f32x4::ZERO; ALL]);
-        let mut squares = f32x4::ZERO;
+        let mut sums = least_squares::Sums::<ALL>::new();
         let [a, b, c] = [speck.a, speck.b, speck.c].map(|v| f32x4::splat(v as f32));
         for (j, pixels) in crop.rows.iter().enumerate().take(crop.height) {
             image.draw_row(template, &Comb::STILL, x, j as f32 - y);
@@ -304,10 +304,7 @@ impl Sums {
             let dy = f32x4::splat(j as f32 - speck.y as f32);
             let mut dx = FIRST_COLUMNS - f32x4::splat(speck.x as f32);
             for first in (0..lanes_end).step_by(LANES) {
-                let four = |row: &Row| {
-                    let lanes = row.get(first..first + LANES).unwrap_or_default();
-                    f32x4::from(<[f32; LANES]>::try_from(lanes).unwrap_or_default())
-                };
+                let four = |row: &Row| four(row, first);
                 let (h, u, v) = speck.light(dx, dy);
                 let (hu, hv) = (h * u, h * v);
                 let columns = [
@@ -322,22 +319,15 @@ impl Sums {
                     -(hu * dy),
                     -(hv * dy),
                 ];
-                let (w, p) = (four(&with_holes), four(pixels));
-                for i in 0..ALL {
-                    let weighted = w * columns[i];
-                    for k in i..ALL {
-                        normal[i][k] += weighted * columns[k];
-                    }
-                    right[i] += weighted * p;
-                }
-                squares += w * p * p;
+                sums.add(&columns, four(&with_holes), four(pixels));
                 dx += f32x4::splat(LANES as f32);
             }
         }
+        let (normal, right, squares) = sums.equations();
         Sums {
-            normal: SMatrix::from_fn(|i, k| f64::from(normal[i.min(k)][i.max(k)].reduce_add())),
-            right: SVector::from_fn(|i, _| f64::from(right[i].reduce_add())),
-            squares: f64::from(squares.reduce_add()),
+            normal,
+            right,
+            squares,
         }
     }
 

@@ -6,6 +6,7 @@
 
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::{Image, Weights};
+use crate::least_squares::{Sums, four};
 use crate::streak::Comb;
 use crate::template::Template;
 use nalgebra::{Matrix2, SMatrix, SVector};
@@ -65,12 +66,11 @@ fn pass_of<const N: usize, const P: usize>(
     beads: &mut [Bead],
     (weights, unit): (Weights, f64),
 ) -> Option<Rest> {
-    let lanes_end = crop.width.next_multiple_of(LANES).min(STRIDE);
+    let lanes_end = crop.lanes_end();
     let mut images: [Image; N] = std::array::from_fn(|_| Image::new(lanes_end));
     let mut weight = weights.of_even(crop);
     let mut model: Row = [0.0; STRIDE];
-    let (mut normal, mut right) = ([[f32x4::ZERO; P]; P], [f32x4::ZERO; P]);
-    let mut squares = f32x4::ZERO;
+    let mut sums = Sums::<P>::new();
     for (j, pixels) in crop.rows.iter().enumerate().take(crop.height) {
         for (image, bead) in images.iter_mut().zip(beads.iter()) {
             let (x, y) = (bead.x_px - crop.x0 as f64, bead.y_px - crop.y0 as f64);
@@ -87,29 +87,15 @@ fn pass_of<const N: usize, const P: usize>(
         }
         weights.of_shot(crop, &model[..lanes_end], &mut weight);
         for first in (0..lanes_end).step_by(LANES) {
-            let four = |row: &Row| {
-                let lanes = row.get(first..first + LANES).unwrap_or_default();
-                f32x4::from(<[f32; LANES]>::try_from(lanes).unwrap_or_default())
-            };
+            let four = |row: &Row| four(row, first);
             let mut columns = [f32x4::ONE; P];
             for (three, image) in columns.chunks_exact_mut(3).zip(&images) {
                 three.copy_from_slice(&[four(&image.by_x), four(&image.by_y), four(&image.value)]);
             }
-            let (w, p) = (four(&weight), four(pixels));
-            for i in 0..P {
-                let weighted = w * columns[i];
-                for k in i..P {
-                    normal[i][k] += weighted * columns[k];
-                }
-                right[i] += weighted * p;
-            }
-            squares += w * p * p;
+            sums.add(&columns, four(&weight), four(pixels));
         }
     }
-    let mut normal =
-        SMatrix::<f64, P, P>::from_fn(|i, k| f64::from(normal[i.min(k)][i.max(k)].reduce_add()));
-    let mut right = SVector::<f64, P>::from_fn(|i, _| f64::from(right[i].reduce_add()));
-    let mut squares = f64::from(squares.reduce_add());
+    let (mut normal, mut right, mut squares) = sums.equations();
     for (k, bead) in beads.iter().enumerate() {
         if let Some((mean, sd)) = bead.contrast {
             let information = unit / (sd * sd);

@@ -35,6 +35,7 @@ mod fix;
 mod frame;
 mod joint;
 mod learn;
+mod least_squares;
 mod left;
 mod level;
 mod lines;
