@@ -51,7 +51,7 @@ impl Again {
         } else {
             0
         };
-        self.had_bead |= !acquired.rows.0.is_empty();
+        self.had_bead |= !acquired.rows.pzt_um.is_empty();
         // Of a run that a lost bead ended, the first missing segment lost it.
         let lost = matches!(&acquired.trouble, Some(Trouble::Ended(ended)) if !ended.may_pass());
         for (place, turn) in self.missing(records).iter().enumerate() {

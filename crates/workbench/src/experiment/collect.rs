@@ -4,7 +4,7 @@
 use crate::experiment::again::Again;
 use crate::experiment::excitation::Experiment;
 use crate::experiment::on_rig::{Acquired, Listener, OnRig, Trouble};
-use crate::experiment::rows::Rows;
+use crate::experiment::rows::{Delivered, Rows};
 use cellpos_ident::experiment::Plan;
 use cellpos_plant::{Hertz, Model};
 use cellpos_reconcile::{Options, ReconcileError, Reconciliation, Record, Verdict, reconcile};
@@ -210,13 +210,7 @@ pub fn record_name(file: &Path) -> String {
 
 /// A run as a record.
 fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Failure> {
-    let (pzt_um, bead_um) = &acquired.rows;
-    let time_s: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * period_s).collect();
-    let mut record =
-        Record::from_rows(&record_name(file), &time_s, pzt_um, bead_um).map_err(refused)?;
-    record.unseen.clone_from(&acquired.unseen);
-    record.frame_age_s.clone_from(&acquired.frame_age_s);
-    record.late_command.clone_from(&acquired.late_command);
+    let mut record = of_rows(&record_name(file), &acquired.rows, period_s)?;
     record.exposure_s = acquired.exposure_s;
     Ok(record)
 }
@@ -227,13 +221,19 @@ fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Fai
 /// # Errors
 /// Ticks that are no record, with what a record needs.
 pub fn of_ticks(name: &str, ticks: &[TickRecord], period_s: f64) -> Result<Record, Failure> {
-    let rows = Rows::of(ticks, (period_s * 1e9).round() as i64);
-    let time_s: Vec<f64> = (0..rows.input.len()).map(|k| k as f64 * period_s).collect();
+    let rows = Rows::of(ticks, (period_s * 1e9).round() as i64).delivered();
+    of_rows(name, &rows, period_s)
+}
+
+fn of_rows(name: &str, rows: &Delivered, period_s: f64) -> Result<Record, Failure> {
+    let time_s: Vec<f64> = (0..rows.pzt_um.len())
+        .map(|k| k as f64 * period_s)
+        .collect();
     let mut record =
-        Record::from_rows(name, &time_s, &rows.input, &rows.delivered_um()).map_err(refused)?;
-    record.frame_age_s = rows.frame_age_s();
-    record.unseen = rows.unseen;
-    record.late_command = rows.stalled;
+        Record::from_rows(name, &time_s, &rows.pzt_um, &rows.bead_um).map_err(refused)?;
+    record.unseen.clone_from(&rows.unseen);
+    record.frame_age_s.clone_from(&rows.frame_age_s);
+    record.late_command.clone_from(&rows.late_command);
     Ok(record)
 }
 

@@ -7,7 +7,7 @@ use crate::experiment::camera_rate::{InPeriods, foreign_rate_hz, other_rate};
 use crate::experiment::exciting::Handing;
 use crate::experiment::identify::held_bead::Setup;
 use crate::experiment::identify::led::{DelayTest, dithered_trips, switch};
-use crate::experiment::rows::{Rows, ended_spans, fix_noise_um};
+use crate::experiment::rows::{Delivered, Rows, ended_spans, fix_noise_um};
 use cellpos_control::{ControllerFile, Pi};
 use cellpos_emulator::WorldConfig;
 use cellpos_ident::delay::dithered_edges;
@@ -74,15 +74,8 @@ pub struct Acquired {
     pub age_s: Option<f64>,
     /// Localisation noise that vision reported, um RMS.
     pub fix_noise_um: Option<f64>,
-    /// The whole run since the loop was closed, row by row: commanded displacement, um, and bead position, um, NaN without one. A
-    /// picture that came twice repeats the position before.
-    pub rows: (Vec<f64>, Vec<f64>),
-    /// Whether a row's frame came but showed no reliable bead.
-    pub unseen: Vec<bool>,
-    /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
-    pub frame_age_s: Vec<f64>,
-    /// Rows whose command came to the board at a time that is not known.
-    pub late_command: Vec<bool>,
+    /// The whole run since the loop was closed, row by row.
+    pub rows: Delivered,
     /// Places in the plan of the segments in which the bead left the view.
     pub out_of_view: Vec<usize>,
     /// Length of an exposure, s; 0 if neither rig file nor camera states it.
@@ -395,7 +388,6 @@ impl OnRig {
                 Err(_) => {}
             }
         }
-        let delivered_um = rows.delivered_um();
         Acquired {
             records,
             neutral_um: ticks
@@ -403,10 +395,7 @@ impl OnRig {
                 .map_or(self.file.first_neutral_um, |t| t.neutral_um),
             age_s: rows.age_s(),
             fix_noise_um: fix_noise_um(ticks),
-            frame_age_s: rows.frame_age_s(),
-            rows: (rows.input, delivered_um),
-            late_command: rows.stalled,
-            unseen: rows.unseen,
+            rows: rows.delivered(),
             out_of_view,
             exposure_s: devices.exposure_s,
             trouble: None,

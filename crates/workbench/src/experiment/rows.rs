@@ -57,6 +57,20 @@ pub(crate) fn ended_spans(ticks: &[TickRecord], spans: &[Span]) -> usize {
     spans.iter().filter(over).count()
 }
 
+/// The rows of a run since the loop was closed.
+pub struct Delivered {
+    /// Commanded displacement, um.
+    pub pzt_um: Vec<f64>,
+    /// Bead position, um; NaN without one. A picture that came twice repeats the position before.
+    pub bead_um: Vec<f64>,
+    /// Whether a row's frame came but showed no reliable bead.
+    pub unseen: Vec<bool>,
+    /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
+    pub frame_age_s: Vec<f64>,
+    /// Rows whose command came to the board at a time that is not known.
+    pub late_command: Vec<bool>,
+}
+
 /// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
 pub(crate) struct Rows {
     /// Command of each row, um.
@@ -185,13 +199,20 @@ impl Rows {
         rows
     }
 
-    /// Positions as the camera delivered them, um.
-    pub(crate) fn delivered_um(&self) -> Vec<f64> {
-        let mut bead_um = self.output.clone();
+    /// The rows of a record, with the positions as the camera delivered them.
+    pub(crate) fn delivered(self) -> Delivered {
+        let frame_age_s = self.frame_age_s();
+        let mut bead_um = self.output;
         for row in (0..bead_um.len()).filter(|row| self.repeated[*row]) {
             repeat_before(&mut bead_um, row);
         }
-        bead_um
+        Delivered {
+            pzt_um: self.input,
+            bead_um,
+            unseen: self.unseen,
+            frame_age_s,
+            late_command: self.stalled,
+        }
     }
 
     /// Mean time from the middle of an exposure to its tick, s; `None` if no frame came in time.

@@ -272,7 +272,7 @@ fn a_picture_that_came_twice_repeats_its_position_for_who_counts_faults_of_the_c
     let rows = Rows::of(&ticks, PERIOD_NS);
     // No measurement: the bead has moved on.
     assert!(twice.iter().all(|&k| rows.output[k].is_nan()));
-    let delivered_um = rows.delivered_um();
+    let delivered_um = rows.delivered().bead_um;
     // Nothing has moved in the first rows.
     let repeats = (10..200).filter(|&k| delivered_um[k] == delivered_um[k - 1]);
     assert_eq!(repeats.collect::<Vec<_>>(), twice);

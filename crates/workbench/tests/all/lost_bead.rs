@@ -69,7 +69,7 @@ fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it
     let begins = "1 of 2 segments were spoilt; segment 1 (60 Hz): the loop was frozen after 0.";
     assert!(told.starts_with(begins), "{told}");
     assert!(matches!(acquired.trouble, Some(Trouble::Spoilt { .. })));
-    let (command_um, bead_um) = &acquired.rows;
+    let (command_um, bead_um) = (&acquired.rows.pzt_um, &acquired.rows.bead_um);
     let moved = |from: usize, to: usize| rms(command_um[from..to].iter().map(|um| um - neutral_um));
     let first = REST + spans[0].start;
     assert!(
