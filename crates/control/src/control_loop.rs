@@ -185,7 +185,7 @@ impl<L: ControlLaw> ControlLoop<L> {
         change(adapter, adapt);
         let (now, to) = (adapter.tuning(adapt), adapter.estimator(adapt));
         let stated = self.parts.estimator.gain_uncertainty;
-        adapter.tell(adapt, stated, &mut state.estimator);
+        adapter.inform(adapt, stated, &mut state.estimator);
         if from.model() != to.model() {
             from.retime(&mut state.estimator, to);
         }

@@ -186,12 +186,7 @@ impl Adapter {
     pub(crate) fn new(config: EstimatorConfig, model: LoopModel) -> Result<Self, BuildError> {
         let ts = model.sample_time_s;
         let move_ticks = dither::move_ticks(ts);
-        let walk_um2 = 2.0 * config.diffusion_um2_per_s * ts;
-        let drift_um2 =
-            (config.neutral_walk_um_per_sqrt_s.max(zero_flow::LEAST) * model.gain_per_s * ts)
-                .powi(2)
-                * ts;
-        let fix_um2 = config.fix_noise_um.powi(2);
+        let zero_flow = ZeroFlow::new(&config, &model)?;
         let hold_um = bound_rms_um(config.diffusion_um2_per_s, 0.0, model.delay_s, ts);
         // Where a lag keeps the plant from moving at once it still gets there, and where it moves at once it may not stay.
         let moves = model.gain_per_s.abs().max(model.fast_gain_per_s().abs()) * ts;
@@ -203,8 +198,8 @@ impl Adapter {
             block: BLOCK * (f64::from(move_ticks) / config.ticks_per_fix).max(1.0) as u32,
             estimators: DELAYS.map(|extra| delayed(config, model, extra)),
             nominal: Estimator::new(config, model)?,
-            whitener: Whitener::new(walk_um2, drift_um2, fix_um2, config.ticks_per_fix)?,
-            zero_flow: ZeroFlow::new(&config, &model)?,
+            whitener: zero_flow.of_design(),
+            zero_flow,
             lines: LineSettings::new(ts, config.ticks_per_fix, jump),
             forward: FeedForward::new(&model)?,
             delay_samples: model.delay_samples(),
@@ -266,7 +261,7 @@ impl Adapter {
     }
 
     /// Tells the estimator what it does not learn itself: how well the gain is known, as a part of `stated`, and how fast the zero flow walks.
-    pub(crate) fn tell(&self, state: &AdaptState, stated: f64, estimator: &mut EstimatorState) {
+    pub(crate) fn inform(&self, state: &AdaptState, stated: f64, estimator: &mut EstimatorState) {
         estimator.gain_doubt = self.gain_doubt(state, stated);
         estimator.beyond_walk_um2_per_s = state.zero_flow.beyond_um2_per_s;
     }

@@ -15,8 +15,9 @@ use crate::loop_model::LoopModel;
 /// the hold.
 const WALKS: usize = 5;
 /// Least of them, um/sqrt(s): what is slower costs the hold nothing.
-pub(super) const LEAST: f64 = 0.01;
-/// Largest rate at which the filter follows the zero flow, times the delay: it takes 15 deg of the phase margin there.
+const LEAST: f64 = 0.01;
+/// Largest rate at which the filter follows the zero flow, times the delay. The sensitivity then peaks below 2, and a faster filter would
+/// take that margin too.
 const FASTEST: f64 = 0.4;
 
 /// The filters.
@@ -55,23 +56,28 @@ impl ZeroFlow {
         let rate_per_s = FASTEST / (model.delay_s + 0.5 * ts);
         let largest = (rate_per_s * walk_um2_per_s.sqrt() / gain_per_s).max(design);
         let factor = (largest / design).powf(1.0 / (WALKS - 1) as f64);
-        let walks_um2_per_s = std::array::from_fn(|k| (design * factor.powi(k as i32)).powi(2));
+        let walks: [f64; WALKS] = std::array::from_fn(|k| design * factor.powi(k as i32));
         let filter = |walk: f64| {
             Whitener::new(
                 walk_um2_per_s * ts,
-                walk * (gain_per_s * ts).powi(2) * ts,
+                (walk * gain_per_s * ts).powi(2) * ts,
                 config.fix_noise_um.powi(2),
                 config.ticks_per_fix,
             )
         };
-        let mut filters = [filter(walks_um2_per_s[0])?; WALKS];
-        for (one, walk) in filters.iter_mut().zip(walks_um2_per_s) {
+        let mut filters = [filter(design)?; WALKS];
+        for (one, walk) in filters.iter_mut().zip(walks).skip(1) {
             *one = filter(walk)?;
         }
         Ok(Self {
-            walks_um2_per_s,
+            walks_um2_per_s: walks.map(|walk| walk * walk),
             filters,
         })
+    }
+
+    /// The filter for the walk of the design.
+    pub(super) fn of_design(&self) -> Whitener {
+        self.filters[0]
     }
 
     /// Nothing known.
