@@ -35,6 +35,7 @@ mod data;
 mod dot;
 mod error;
 mod fit;
+mod mask;
 mod model_error;
 mod problem;
 mod report;

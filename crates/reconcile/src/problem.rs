@@ -6,10 +6,12 @@ use crate::data::free::Free;
 use crate::data::motion::FlowPaths;
 use crate::data::noise::NoiseModel;
 use crate::data::record::{Record, command_range_um};
+use crate::data::row_noise::RowNoise;
 use crate::data::uncertain::{anywhere_at, uncertain_command};
 use crate::data::waits::waits;
 use crate::data::whitener::Whitener;
 use crate::dot::dot;
+use crate::mask::Mask;
 use crate::model_error::STEP;
 use crate::simulate::{Base, Effect, Input, Sampling, simulate};
 use crate::thresholds::THRESHOLDS;
@@ -19,54 +21,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Start of a record with an analogue input that is not scored \[s\].
 const RUN_IN_S: f64 = 0.5;
-
-/// Which rows of which record count in a fit: ranges per record.
-pub(crate) type Mask = Vec<Vec<Range<usize>>>;
-
-/// The first 60 % of every record, to fit on, and the rest, to judge by.
-pub(crate) fn split_in_time(records: &[Prepared]) -> (Mask, Mask) {
-    let of = |r: &Prepared| (r.u.len() * 6 / 10, r.u.len());
-    let cuts: Vec<(usize, usize)> = records.iter().map(of).collect();
-    (before(&cuts), after(&cuts))
-}
-
-/// Twice rows to fit on and rows to judge by: the first 60 % of what a change of the innovations does in every record, and the last
-/// 60 %. Rows that it does not change say nothing of it: in a share of the time there may be none that do.
-pub(crate) fn splits_of(change: &[Vec<f64>]) -> [(Mask, Mask); 2] {
-    let cuts = |share: f64| -> Vec<(usize, usize)> {
-        let of = |c: &Vec<f64>| (row_at(c, share), c.len());
-        change.iter().map(of).collect()
-    };
-    let (late, early) = (cuts(0.6), cuts(0.4));
-    [
-        (before(&late), after(&late)),
-        (after(&early), before(&early)),
-    ]
-}
-
-/// The row by which a change has done a share of the whole; without one, that share of the rows.
-fn row_at(change: &[f64], share: f64) -> usize {
-    let whole = dot(change, change);
-    if whole <= 0.0 {
-        return (share * change.len() as f64) as usize;
-    }
-    let mut done = 0.0;
-    let by = |x: &f64| {
-        done += x * x;
-        done >= share * whole
-    };
-    change.iter().position(by).map_or(change.len(), |k| k + 1)
-}
-
-fn before(cuts: &[(usize, usize)]) -> Mask {
-    let of = |(cut, _): &(usize, usize)| std::iter::once(0..*cut).collect();
-    cuts.iter().map(of).collect()
-}
-
-fn after(cuts: &[(usize, usize)]) -> Mask {
-    let of = |(cut, rows): &(usize, usize)| std::iter::once(*cut..*rows).collect();
-    cuts.iter().map(of).collect()
-}
 
 /// One record, ready.
 #[derive(Debug, Clone)]
@@ -78,7 +32,8 @@ pub(crate) struct Prepared {
     pub y: Vec<f64>,
     pub present: Vec<bool>,
     pub whitener: Whitener,
-    pub extra_walk: Option<Vec<f64>>,
+    /// Noise of single rows.
+    pub row_noise: RowNoise,
     pub rest: bool,
     /// When its frames were exposed.
     pub sampling: Sampling,
@@ -86,6 +41,8 @@ pub(crate) struct Prepared {
     transients: Vec<Vec<f64>>,
     /// Responses by which the model is off with a standard deviation of 1.
     model_errors: Vec<Vec<f64>>,
+    /// The same for the mean by which frames are late, if they are late by random times.
+    late_error: Option<Vec<f64>>,
     /// Where a zero flow that is off, and one that drifts, take the bead.
     flow: FlowPaths,
     /// Whether the noise has a zero flow that drifts.
@@ -126,7 +83,7 @@ impl Prepared {
 
     /// The filter of a noise, and orthonormal innovations of the transients under it.
     fn set_noise(&mut self, noise: &NoiseModel) {
-        self.whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
+        self.whitener = Whitener::new(noise, &self.present, &self.row_noise);
         self.drifts = noise.zero_flow.is_some();
         self.free = Free::new(
             noise,
@@ -139,7 +96,18 @@ impl Prepared {
 
     /// Twice the negative log-likelihood of a residual under another noise, without a constant.
     pub(crate) fn unlikelihood(&self, noise: &NoiseModel, residual: &[f64]) -> f64 {
-        let whitener = Whitener::new(noise, &self.present, self.extra_walk.as_deref());
+        let (e, log_determinant) = self.innovations(noise, &self.row_noise, residual);
+        dot(&e, &e) + log_determinant
+    }
+
+    /// Innovations of a residual under other noise, and the logarithm of the determinant of its covariance.
+    pub(crate) fn innovations(
+        &self,
+        noise: &NoiseModel,
+        rows: &RowNoise,
+        residual: &[f64],
+    ) -> (Vec<f64>, f64) {
+        let whitener = Whitener::new(noise, &self.present, rows);
         let free = Free::new(
             noise,
             &whitener,
@@ -150,7 +118,8 @@ impl Prepared {
         let mut e = vec![0.0; residual.len()];
         whitener.apply(residual, &mut e);
         free.take_off(&mut e);
-        dot(&e, &e) + whitener.log_determinant() + free.log_determinant()
+        let log_determinant = whitener.log_determinant() + free.log_determinant();
+        (e, log_determinant)
     }
 
     /// A residual, or its first rows, without the transients, a level and, if asked for, a ramp.
@@ -274,6 +243,10 @@ pub(crate) struct Problem {
     /// The model's stated error.
     errors: Errors,
     pub noise: NoiseModel,
+    /// Whether the zero flow may wander by more than that of a rig does.
+    pub wanders: bool,
+    /// What the noise of single rows does to the mean of the positions.
+    pub mean: Vec<Effect>,
     /// Bounds of the share of the newest command's direct path that a frame already shows \[um per um\].
     ///
     /// The direct path of Eq. (6) acts at once; a frame whose exposure straddles the command's edge shows a part of it. It is a
@@ -329,8 +302,11 @@ impl Problem {
                     .zip(&present)
                     .map(|(b, p)| if *p { *b } else { 0.0 })
                     .collect();
-                let extra_walk = uncertain_command(r, velocity * base.sample_s);
-                let whitener = Whitener::new(&noise, &present, extra_walk.as_deref());
+                let row_noise = RowNoise {
+                    walk: uncertain_command(r, velocity * base.sample_s),
+                    white: None,
+                };
+                let whitener = Whitener::new(&noise, &present, &row_noise);
                 let flow = flow_paths(&base, r.rows());
                 let sampling = Sampling {
                     exposure_s: r.exposure_s,
@@ -338,6 +314,7 @@ impl Problem {
                 };
                 let mut prepared = Prepared {
                     model_errors: errors.responses(&u, &sampling, &[]),
+                    late_error: None,
                     transients: transients(&base, &flow, r.rows()),
                     flow,
                     drifts: false,
@@ -348,7 +325,7 @@ impl Problem {
                     y,
                     present,
                     whitener,
-                    extra_walk,
+                    row_noise,
                     rest: r.rests_within(THRESHOLDS.rest_share * range_um),
                     sampling,
                 };
@@ -361,6 +338,8 @@ impl Problem {
             records: prepared,
             errors,
             noise,
+            wanders: false,
+            mean: Vec::new(),
             soft: (-0.4 * kick, 1.3 * kick),
             quantised: records.iter().any(Record::is_quantised),
             work: Arc::default(),
@@ -389,9 +368,29 @@ impl Problem {
     /// The same problem with positions that are anywhere from some rows of each record on.
     pub(crate) fn open_at(mut self, rows: impl Fn(usize) -> Vec<usize>) -> Self {
         for (i, r) in self.records.iter_mut().enumerate() {
-            r.extra_walk = Some(anywhere_at(&rows(i), &r.y, r.extra_walk.take()));
+            let walk = &mut r.row_noise.walk;
+            *walk = Some(anywhere_at(&rows(i), &r.y, walk.take()));
             r.set_noise(&self.noise);
         }
+        self
+    }
+
+    /// The same problem with frames that are late by random times of a standard deviation \[s\]: `mean` is what they are late by in the
+    /// mean, and that has an error \[s\]. `speeds` are those of the bead in every record \[um/s\].
+    pub(crate) fn with_late_frames(
+        mut self,
+        (sd_s, (mean, error_s)): (f64, (Option<Effect>, f64)),
+        speeds: &[Vec<f64>],
+    ) -> Self {
+        for (r, speeds) in self.records.iter_mut().zip(speeds) {
+            r.row_noise.white = Some(speeds.iter().map(|v| (v * sd_s).powi(2)).collect());
+            r.late_error = mean
+                .is_some()
+                .then(|| speeds.iter().map(|v| v * error_s).collect());
+            r.model_errors.extend(r.late_error.clone());
+            r.set_noise(&self.noise);
+        }
+        self.mean = mean.into_iter().collect();
         self
     }
 
@@ -407,6 +406,7 @@ impl Problem {
         }
         for r in &mut self.records {
             r.model_errors = self.errors.responses(&r.u, &r.sampling, effects);
+            r.model_errors.extend(r.late_error.clone());
             r.set_noise(&self.noise);
         }
         self
@@ -447,11 +447,15 @@ impl Problem {
         self.records.iter().zip(residuals).map(of).sum()
     }
 
+    /// Rows of each record.
+    pub(crate) fn rows(&self) -> impl Iterator<Item = usize> {
+        self.records.iter().map(|r| r.u.len())
+    }
+
     /// All rows.
     pub(crate) fn all(&self) -> Mask {
-        self.records
-            .iter()
-            .map(|r| std::iter::once(0..r.u.len()).collect())
+        self.rows()
+            .map(|n| std::iter::once(0..n).collect())
             .collect()
     }
 
@@ -476,15 +480,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_few_rows_show_is_split_within_these() {
-        let few: Vec<f64> = (0..1000)
-            .map(|k| f64::from(u8::from((600..700).contains(&k))))
-            .collect();
-        let [late, early] = splits_of(&[few, vec![0.0; 10]]);
-        let one_each = |of: [Range<usize>; 2]| of.map(|rows| Vec::from_iter([rows]));
-        assert_eq!(late.0, one_each([0..660, 0..6]));
-        assert_eq!(late.1, one_each([660..1000, 6..10]));
-        assert_eq!(early.0, one_each([640..1000, 4..10]));
-        assert_eq!(early.1, one_each([0..640, 0..4]));
+    fn further_variance_of_every_position_is_that_of_a_worse_fix() {
+        let rows = RowNoise {
+            walk: None,
+            white: Some(vec![3e-4; 40]),
+        };
+        let n = NoiseModel::new(0.33, 1e-3, 0.030);
+        let worse = NoiseModel {
+            white_um2: n.white_um2 + 3e-4,
+            ..n
+        };
+        let of = |noise: &NoiseModel, rows: &RowNoise| {
+            let filter = Whitener::new(noise, &[true; 40], rows);
+            filter.transpose(&[1.0; 40])
+        };
+        assert_eq!(of(&n, &rows), of(&worse, &RowNoise::default()));
     }
 }

@@ -1,5 +1,6 @@
 //! Which effects are hidden, at which levels.
 
+use super::strangers::Stranger as Odd;
 use super::{Excitation, Hidden, Kind, Rig, Second};
 
 /// Properties of a case's records other than the hidden effects.
@@ -206,7 +207,10 @@ pub fn nulls(count: usize) -> Vec<Case> {
 /// Effects that entered the catalogue later, in the first equation.
 pub fn further() -> Vec<Case> {
     use Hidden::*;
+    let known = Odd::KNOWN.into_iter();
+    let known = known.flat_map(|s| [s.times(1.0 / 1.6), s.times(1.6)].map(Hidden::Stranger));
     [
+        Jumps(1.5),
         Cube(20.0),
         Stiffening(0.02),
         Stiffening(0.1),
@@ -217,6 +221,8 @@ pub fn further() -> Vec<Case> {
         Shake(90.0, 0.05, 0.02),
         Shake(180.0, 0.1, 0.1),
     ]
+    .into_iter()
+    .chain(known)
     .map(|h| Case::new("further", vec![h], Session::STANDARD))
-    .to_vec()
+    .collect()
 }

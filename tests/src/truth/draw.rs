@@ -207,7 +207,7 @@ pub fn strangers(seed: u64) -> Vec<Case> {
         H::Echo(0.3 * factor(), 0.02 * factor()),
         H::Distortion(0.003 * factor()),
     ];
-    all.extend(Stranger::ALL.map(|s| H::Stranger(s.times(factor()))));
+    all.extend(Stranger::FOREIGN.map(|s| H::Stranger(s.times(factor()))));
     all.into_iter()
         .map(|h| Case::new("stranger", vec![h], Session::DRAWN))
         .collect()
@@ -263,7 +263,7 @@ pub fn floorless(seed: u64) -> Vec<Case> {
                     vec![effect(kind, &mut random)]
                 }
                 _ => {
-                    let odd = Stranger::ALL[random.index(Stranger::ALL.len())];
+                    let odd = Stranger::FOREIGN[random.index(Stranger::FOREIGN.len())];
                     vec![Hidden::Stranger(odd)]
                 }
             };

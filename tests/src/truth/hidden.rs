@@ -37,9 +37,9 @@ pub enum Hidden {
     Jumps(f64),
     /// Another equation of an effect of the catalogue.
     Second(Second),
-    // Not in the catalogue:
-    /// One of the other strangers.
+    /// With a memory or a chance of its own.
     Stranger(Stranger),
+    // Not in the catalogue:
     /// Velocity += c d^2.
     Square(f64),
     /// Velocity += c d^3.
@@ -90,6 +90,7 @@ impl Hidden {
                 vec![("frequency_hz", hz), ("damping", zeta), ("share", share)]
             }
             Self::Second(second) => second.parameters(),
+            Self::Stranger(stranger) => stranger.parameters(),
             _ => Vec::new(),
         }
     }
@@ -122,6 +123,7 @@ impl Hidden {
             Self::Swing(..) => "gain-swing",
             Self::Shake(..) => "camera-shake",
             Self::Second(second) => second.id(),
+            Self::Stranger(stranger) => stranger.id(),
             Self::Valve(_) => "valve-asymmetry",
             Self::Jumps(_) => "jumps",
             _ => "outside",

@@ -1,4 +1,4 @@
-//! Effects that no equation of the catalogue fits, or that it does not look for.
+//! Effects of a memory or a chance of their own: some of the catalogue, and those that no equation of it fits.
 
 use super::random::Random;
 use super::signal::{Through, low_pass, rk4};
@@ -38,15 +38,19 @@ pub enum Stranger {
 }
 
 impl Stranger {
-    /// All kinds, at sizes about the middle of what matters.
-    pub const ALL: [Self; 14] = [
+    /// Those of the catalogue, at sizes about the middle of what matters.
+    pub const KNOWN: [Self; 5] = [
         Self::StickSlip(30.0, 8.0),
         Self::FlowWander(6.0, 1.5),
         Self::Pulsation(5.3, 0.4, 0.3),
         Self::FrameJitter(0.0005),
+        Self::CurvedLens(1e-4),
+    ];
+
+    /// The others, likewise.
+    pub const FOREIGN: [Self; 9] = [
         Self::DeadZone(0.12),
         Self::Turbulence(0.05),
-        Self::CurvedLens(1e-4),
         Self::UnequalLag(300.0, 2.0),
         Self::Notch(70.0, 0.6),
         Self::Telegraph(0.12, 3.0),
@@ -55,6 +59,32 @@ impl Stranger {
         Self::Volterra(0.15, 0.1),
         Self::MissedCommands(0.01),
     ];
+
+    /// The id of the vocabulary, or `outside`.
+    pub fn id(self) -> &'static str {
+        match self {
+            Self::StickSlip(..) => "stick-slip",
+            Self::FlowWander(..) => "flow-wander",
+            Self::Pulsation(..) => "pump-pulsation",
+            Self::FrameJitter(_) => "frame-jitter",
+            Self::CurvedLens(_) => "lens-distortion",
+            _ => "outside",
+        }
+    }
+
+    /// Parameters whose equation is that of the catalogue.
+    pub fn parameters(self) -> Vec<(&'static str, f64)> {
+        match self {
+            Self::StickSlip(start, stop) => {
+                vec![("break_um_per_s", start), ("stop_um_per_s", stop)]
+            }
+            Self::FlowWander(rms, time) => vec![("um_per_s", rms), ("time_s", time)],
+            Self::Pulsation(hz, um, second) => vec![("hz", hz), ("um", um), ("second", second)],
+            Self::FrameJitter(up_to) => vec![("up_to_s", up_to)],
+            Self::CurvedLens(c) => vec![("per_um2", c)],
+            _ => Vec::new(),
+        }
+    }
 
     /// The same kind, its size times a factor.
     pub fn times(self, f: f64) -> Self {

@@ -1,6 +1,10 @@
 //! `lens-distortion`: the scale of the image changes across the field.
 
-use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Shown, Spec};
+use super::candidate::{grid, lin};
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Shown,
+    Spec,
+};
 
 /// `x + per_um2 (x - axis)^3` about the axis of the lens.
 pub fn lens_distortion(per_um2: f64, axis_um: f64) -> Effect {
@@ -36,6 +40,21 @@ impl EffectKind for LensDistortion {
             axis_um: effect.scalar(1),
         }))
     }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[
+            lin("per_um2", -1.0, 1.0, 1e-7),
+            lin("axis_um", -1e3, 1e3, 1e-2),
+        ])];
+        ALL
+    }
+
+    fn starts(&self, _: usize, scope: &Scope) -> Vec<Vec<f64>> {
+        // 2 % of the travel at its end, about the start of the records and about either end.
+        let share = 0.02 / scope.travel_um.powi(2);
+        let axes = [-1.0, 0.0, 1.0].map(|times| times * scope.travel_um);
+        grid(&[-share, share], &axes)
+    }
 }
 
 #[derive(Debug, Clone)]
@@ -47,6 +66,10 @@ struct Lens {
 impl Shown for Lens {
     fn show(&mut self, seen_um: f64, _: f64) -> f64 {
         seen_um + self.per_um2 * (seen_um - self.axis_um).powi(3)
+    }
+
+    fn is_static(&self) -> bool {
+        true
     }
 
     fn duplicate(&self) -> Box<dyn Shown> {

@@ -1,7 +1,10 @@
 //! `stick-slip`: the bead sticks until it breaks free, then moves until the flow is slow.
 
+use super::candidate::grid;
 use super::speed_law::{OfSpeed, SpeedLaw};
-use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec};
+use super::{
+    Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, log,
+};
 
 /// Stuck until the flow reaches `break_um_per_s`, free until it falls below `stop_um_per_s`.
 pub fn stick_slip(break_um_per_s: f64, stop_um_per_s: f64) -> Effect {
@@ -44,6 +47,24 @@ impl EffectKind for StickSlip {
             return Err("stop_um_per_s must not be above break_um_per_s");
         }
         Ok(())
+    }
+
+    fn has_doubles(&self) -> bool {
+        true
+    }
+
+    fn candidates(&self) -> &'static [Candidate] {
+        const ALL: &[Candidate] = &[Candidate::chain(&[
+            log("break_um_per_s", 0.5, 2e3),
+            log("stop_um_per_s", 0.05, 2e3),
+        ])
+        .typical(5.0, 300.0)
+        .smallest(0, 5.0)];
+        ALL
+    }
+
+    fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
+        grid(&[12.0, 30.0, 75.0], &[3.0, 10.0])
     }
 
     fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {

@@ -5,6 +5,7 @@
 //! an error. Not for lines: a line is no noise, and a fit that leaves one is refused.
 
 use crate::data::noise::{Coloured, NoiseModel};
+use crate::data::row_noise::RowNoise;
 use crate::data::whitener::Whitener;
 use cellpos_numeric::fft;
 
@@ -45,7 +46,7 @@ pub(crate) struct Alone<'a> {
 
 /// Twice the negative log-likelihood of noise of a shape, its size set free, and that size (of a white variance of 1).
 fn cost(alone: &Alone<'_>, shape: &NoiseModel) -> (f64, f64) {
-    let w = Whitener::new(shape, alone.counts, None);
+    let w = Whitener::new(shape, alone.counts, &RowNoise::default());
     let mut e = vec![0.0; alone.values.len()];
     w.apply(alone.values, &mut e);
     let n = w.count().max(1) as f64;
@@ -132,7 +133,7 @@ fn coloured(alone: &Alone<'_>) -> Option<(Shape, f64)> {
 /// Whether the innovations under a noise hold no line: the periodogram of white ones has none above its mean times [`LINE`].
 fn is_white(alone: &Alone<'_>, noise: &NoiseModel) -> bool {
     let mut e = vec![0.0; alone.values.len()];
-    Whitener::new(noise, alone.counts, None).apply(alone.values, &mut e);
+    Whitener::new(noise, alone.counts, &RowNoise::default()).apply(alone.values, &mut e);
     let powers: Vec<f64> = fft::forward(&mut e)
         .iter()
         .skip(1)

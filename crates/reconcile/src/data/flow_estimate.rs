@@ -86,6 +86,7 @@ fn correlate(values: &mut [f64], keep: f64) {
 mod tests {
     use super::*;
     use crate::data::motion::ZeroFlow;
+    use crate::data::row_noise::RowNoise;
 
     fn noise() -> NoiseModel {
         NoiseModel {
@@ -111,7 +112,7 @@ mod tests {
             .collect();
         let rows = motions.len();
         let noise = noise();
-        let whitener = Whitener::new(&noise, &vec![true; rows], None);
+        let whitener = Whitener::new(&noise, &vec![true; rows], &RowNoise::default());
         let paths = FlowPaths::new((0..rows).map(|k| k as f64).collect());
         let transients = if off { vec![paths.off.clone()] } else { vec![] };
         let free = Free::new(&noise, &whitener, &transients, &paths, &[]);

@@ -137,6 +137,7 @@ impl Free {
 mod tests {
     use super::*;
     use crate::data::motion::ZeroFlow;
+    use crate::data::row_noise::RowNoise;
 
     #[test]
     fn squares_and_determinant_are_those_of_a_covariance_with_the_drift_in_it() {
@@ -151,7 +152,7 @@ mod tests {
             ..NoiseModel::new(0.33, 1e-3, 0.0)
         };
         let y = [0.0, 0.03, 0.11];
-        let whitener = Whitener::new(&noise, &[true; 3], None);
+        let whitener = Whitener::new(&noise, &[true; 3], &RowNoise::default());
         let flow = FlowPaths::new(vec![0.0, 1.0, 2.0]);
         let free = Free::new(&noise, &whitener, &[], &flow, &[]);
         let mut e = [0.0; 3];

@@ -4,6 +4,7 @@
 use crate::data::flow_loss::FlowLoss;
 use crate::data::motion::ZeroFlow;
 use crate::data::noise::NoiseModel;
+use crate::data::row_noise::RowNoise;
 use nalgebra::Matrix3;
 
 /// Gains by row, zero where a frame is missing.
@@ -15,12 +16,12 @@ pub(super) struct Gains {
 }
 
 impl Gains {
-    /// `present[k]`: the frame counts. `extra_walk[k]`: variance added to the walk before frame k \[um^2\].
+    /// `present[k]`: the frame counts.
     pub(super) fn new(
         noise: &NoiseModel,
         (z, chip): (&ZeroFlow, FlowLoss),
         present: &[bool],
-        extra_walk: Option<&[f64]>,
+        rows: &RowNoise,
     ) -> Self {
         let none = || vec![0.0; present.len()];
         let mut gains = Self {
@@ -40,7 +41,7 @@ impl Gains {
                 p = step * p * step.transpose();
                 p[(1, 1)] += z.fresh_um2();
             }
-            p[(0, 0)] += noise.walk_um2 + extra_walk.map_or(0.0, |w| w[k]);
+            p[(0, 0)] += noise.walk_um2 + rows.walk_um2(k);
             if !present[k] {
                 continue;
             }
@@ -50,10 +51,10 @@ impl Gains {
                 gains.walk[k] = 1.0;
                 p.fill_row(0, 0.0);
                 p.fill_column(0, 0.0);
-                p[(0, 0)] = noise.white_um2;
+                p[(0, 0)] = noise.white_um2 + rows.white_um2(k);
                 continue;
             }
-            let s = p[(0, 0)] + noise.white_um2;
+            let s = p[(0, 0)] + noise.white_um2 + rows.white_um2(k);
             let gain = p.column(0) / s;
             p -= gain * gain.transpose() * s;
             gains.inverse_sigma[k] = 1.0 / s.sqrt();

@@ -7,6 +7,7 @@
 use crate::data::cleaned::increment_moments;
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
+use crate::data::row_noise::RowNoise;
 use crate::data::whitener::Whitener;
 use crate::dot::dot;
 use crate::thresholds::THRESHOLDS;
@@ -40,7 +41,7 @@ pub(super) fn without_response(
     present: &[bool],
     noise: &NoiseModel,
 ) -> Option<(Vec<f64>, usize)> {
-    let whitener = Whitener::new(noise, present, None);
+    let whitener = Whitener::new(noise, present, &RowNoise::default());
     let rows = residual_um.len().min(command_um.len());
     let blocks = blocks();
     if whitener.count() < ROWS_A_NUMBER * (blocks.len() + 1) {

@@ -8,6 +8,7 @@
 use crate::data::flow_loss::FlowLoss;
 use crate::data::loss_filter::Gains;
 use crate::data::noise::NoiseModel;
+use crate::data::row_noise::RowNoise;
 
 impl NoiseModel {
     /// Standard deviation of the innovation in the steady state \[um\]: the floor.
@@ -17,7 +18,7 @@ impl NoiseModel {
         if let Some(time_rows) = slow_rows {
             // No closed form: the filter after so many rows that it stands still.
             let rows = 64 + (8.0 * time_rows).min(20_000.0) as usize;
-            let filter = Whitener::new(self, &vec![true; rows], None);
+            let filter = Whitener::new(self, &vec![true; rows], &RowNoise::default());
             return 1.0 / filter.inverse_sigma[rows - 1];
         }
         let (q, r) = (self.walk_um2, self.white_um2);
@@ -70,11 +71,11 @@ struct Spread {
 }
 
 impl Whitener {
-    /// `present[k]`: the frame counts. `extra_walk[k]`: variance added to the walk before frame k \[um^2\].
-    pub(crate) fn new(noise: &NoiseModel, present: &[bool], extra_walk: Option<&[f64]>) -> Self {
+    /// `present[k]`: the frame counts.
+    pub(crate) fn new(noise: &NoiseModel, present: &[bool], rows: &RowNoise) -> Self {
         debug_assert!(noise.coloured.is_none() || noise.zero_flow.is_none());
         if let Some((z, chip)) = noise.zero_flow.and_then(|z| Some((z, z.loss?))) {
-            let gains = Gains::new(noise, (&z, chip), present, extra_walk);
+            let gains = Gains::new(noise, (&z, chip), present, rows);
             return Self {
                 gain: gains.walk,
                 inverse_sigma: gains.inverse_sigma,
@@ -117,11 +118,12 @@ impl Whitener {
                 p.second = keep * keep * p.second + fresh;
                 p.both *= keep;
             }
-            p.walk += noise.walk_um2 + extra_walk.map_or(0.0, |w| w[k]);
+            p.walk += noise.walk_um2 + rows.walk_um2(k);
             if !present[k] {
                 continue;
             }
             // What the second state adds to the position itself.
+            let white_um2 = noise.white_um2 + rows.white_um2(k);
             let (own, shared) = if added {
                 (p.second, p.both)
             } else {
@@ -131,13 +133,13 @@ impl Whitener {
                 // The first frame only says where the bead is: the start is a nuisance.
                 gain[k] = 1.0;
                 p = Spread {
-                    walk: noise.white_um2 + own,
+                    walk: white_um2 + own,
                     second: p.second,
                     both: -own,
                 };
                 continue;
             }
-            let s = p.walk + 2.0 * shared + own + noise.white_um2;
+            let s = p.walk + 2.0 * shared + own + white_um2;
             gain[k] = (p.walk + shared) / s;
             inverse_sigma[k] = 1.0 / s.sqrt();
             let of_second = (own + p.both) / s;
@@ -349,7 +351,7 @@ mod tests {
     #[test]
     fn whitening_a_ramp_gives_its_closed_form_and_an_offset_gives_nothing() {
         let n = NoiseModel::new(0.33, 1e-3, 0.030);
-        let w = Whitener::new(&n, &vec![true; 2000], None);
+        let w = Whitener::new(&n, &vec![true; 2000], &RowNoise::default());
         let mut e = vec![0.0; 2000];
         w.apply(&vec![7.0; 2000], &mut e);
         assert!(e.iter().all(|e| e.abs() < 1e-9));
@@ -365,7 +367,7 @@ mod tests {
     fn transposed_as_applied(noise: &NoiseModel) {
         let mut present = vec![true; 60];
         present[17] = false;
-        let w = Whitener::new(noise, &present, None);
+        let w = Whitener::new(noise, &present, &RowNoise::default());
         let wave = |a: f64| -> Vec<f64> { (0..60).map(|k| (a * f64::from(k)).sin()).collect() };
         let (r, weights) = (wave(0.7), wave(1.9));
         let mut e = vec![0.0; 60];
@@ -398,7 +400,7 @@ mod tests {
         let (q, v, r) = (n.walk_um2, 0.02, n.white_um2);
         let variance = q + 2.0 * v * (1.0 - keep) + 2.0 * r;
         let next = v * (2.0 * keep - 1.0 - keep * keep) - r;
-        let filter = Whitener::new(&n, &[true; 3], None);
+        let filter = Whitener::new(&n, &[true; 3], &RowNoise::default());
         let expected = (variance * variance - next * next).ln();
         assert!((filter.log_determinant() - expected).abs() < 1e-12);
         transposed_as_applied(&n);
@@ -420,7 +422,7 @@ mod tests {
         let (q, r, v) = (n.walk_um2, n.white_um2, zero_flow.motion_um2);
         let variance = q + 2.0 * r + v;
         let next = zero_flow.keep() * v - r;
-        let filter = Whitener::new(&n, &[true; 3], None);
+        let filter = Whitener::new(&n, &[true; 3], &RowNoise::default());
         let expected = (variance * variance - next * next).ln();
         assert!((filter.log_determinant() - expected).abs() < 1e-12);
         let y = [0.3, 0.41, 0.37];
@@ -470,7 +472,7 @@ mod tests {
         let (q, r) = (n.walk_um2, n.white_um2);
         let variance = q + 2.0 * r + motion(0);
         let next = motion(1) - r;
-        let filter = Whitener::new(&n, &[true; 3], None);
+        let filter = Whitener::new(&n, &[true; 3], &RowNoise::default());
         let expected = (variance * variance - next * next).ln();
         let found = filter.log_determinant();
         assert!((found - expected).abs() < 1e-10, "{found} {expected}");
@@ -482,7 +484,7 @@ mod tests {
         let n = NoiseModel::new(0.33, 1e-3, 0.030);
         let mut present = vec![true; 100];
         present[50] = false;
-        let w = Whitener::new(&n, &present, None);
+        let w = Whitener::new(&n, &present, &RowNoise::default());
         assert_eq!(w.count(), 98);
         assert!(w.sigma_um(51).unwrap() > w.sigma_um(49).unwrap());
         assert!(w.sigma_um(50).is_none());

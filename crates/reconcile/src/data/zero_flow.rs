@@ -10,6 +10,9 @@ use crate::data::noise::NoiseModel;
 /// standard deviation of the logarithm. Without this prior a leak is mistaken for a zero flow that follows the command.
 const DISPLACEMENT_UM: (f64, f64) = (0.007, 1.0);
 const TIME_S: (f64, f64) = (17.0, 0.9);
+/// The same for a flow that wanders beyond that of a rig, and has a name (`flow-wander`): 1 to 20 um/s RMS, 0.2 to 10 s.
+const WANDER_UM_PER_S: (f64, f64) = (4.5, 0.75);
+const WANDER_S: (f64, f64) = (1.4, 1.0);
 /// Standard deviations from the medians within which it is noise: 95 % of the rigs. What moves by more is an effect that has a name, or the
 /// misfit of a set that lacks one, and no noise hides it.
 const MOST: f64 = 2.0;
@@ -22,6 +25,10 @@ pub(crate) struct Prior {
     sample_s: f64,
     /// Motion of the bead in a row over displacement.
     motion_per_um: f64,
+    /// Median of the displacement \[um\], and standard deviation of its logarithm.
+    displacement_um: (f64, f64),
+    /// The same of the time \[s\].
+    time_s: (f64, f64),
 }
 
 impl Prior {
@@ -30,16 +37,28 @@ impl Prior {
         Self {
             sample_s,
             motion_per_um: speed_per_um * sample_s,
+            displacement_um: DISPLACEMENT_UM,
+            time_s: TIME_S,
+        }
+    }
+
+    /// The same for a flow that wanders more than that of a rig does.
+    pub(crate) fn of_wandering(self) -> Self {
+        let (median, sd) = WANDER_UM_PER_S;
+        Self {
+            displacement_um: (median * self.sample_s / self.motion_per_um, sd),
+            time_s: WANDER_S,
+            ..self
         }
     }
 
     /// The zero flow at a number of standard deviations from the medians of displacement and time.
     fn at(&self, way: [f64; 2]) -> ZeroFlow {
         let [size, time] = way.map(|x| x.clamp(-MOST, MOST));
-        let displacement_um = DISPLACEMENT_UM.0 * (DISPLACEMENT_UM.1 * size).exp();
+        let displacement_um = self.displacement_um.0 * (self.displacement_um.1 * size).exp();
         ZeroFlow {
             motion_um2: (displacement_um * self.motion_per_um).powi(2),
-            time_rows: TIME_S.0 * (TIME_S.1 * time).exp() / self.sample_s,
+            time_rows: self.time_s.0 * (self.time_s.1 * time).exp() / self.sample_s,
             drift_um: DRIFT_UM_PER_S * self.sample_s * self.motion_per_um,
             loss: None,
         }
@@ -50,8 +69,8 @@ impl Prior {
         let displacement_um = z.motion_um2.sqrt() / self.motion_per_um;
         let time_s = z.time_rows * self.sample_s;
         [
-            (displacement_um / DISPLACEMENT_UM.0).ln() / DISPLACEMENT_UM.1,
-            (time_s / TIME_S.0).ln() / TIME_S.1,
+            (displacement_um / self.displacement_um.0).ln() / self.displacement_um.1,
+            (time_s / self.time_s.0).ln() / self.time_s.1,
         ]
     }
 
@@ -78,10 +97,38 @@ impl Prior {
         noise: &NoiseModel,
         unlikelihood: impl Fn(&NoiseModel) -> f64,
     ) -> f64 {
-        const STEP: f64 = 0.3;
         let Some(z) = &noise.zero_flow else {
             return 0.0;
         };
+        let [size, time, cross] = self.information(noise, z, unlikelihood);
+        let determinant = (1.0 + size) * (1.0 + time) - cross * cross;
+        let way = self.of(z);
+        way.iter().map(|x| x * x).sum::<f64>() + determinant.max(1.0).ln()
+    }
+
+    /// Standard errors of the logarithms of size and time of the zero flow of a noise.
+    pub(crate) fn errors(
+        &self,
+        noise: &NoiseModel,
+        unlikelihood: impl Fn(&NoiseModel) -> f64,
+    ) -> [f64; 2] {
+        let Some(z) = &noise.zero_flow else {
+            return [f64::INFINITY; 2];
+        };
+        let [size, time, cross] = self.information(noise, z, unlikelihood);
+        let determinant = ((1.0 + size) * (1.0 + time) - cross * cross).max(1.0);
+        let [of_size, of_time] = [1.0 + time, 1.0 + size].map(|i| (i / determinant).sqrt());
+        [self.displacement_um.1 * of_size, self.time_s.1 * of_time]
+    }
+
+    /// Information of the records on size, time and both, in the prior's standard deviations.
+    fn information(
+        &self,
+        noise: &NoiseModel,
+        z: &ZeroFlow,
+        unlikelihood: impl Fn(&NoiseModel) -> f64,
+    ) -> [f64; 3] {
+        const STEP: f64 = 0.3;
         let x = self.of(z);
         let value = |way: [f64; 2], step: f64| {
             unlikelihood(&self.noise_at(noise, [x[0] + step * way[0], x[1] + step * way[1]]))
@@ -92,9 +139,7 @@ impl Prior {
             let bend = value(way, STEP) + value(way, -STEP) - 2.0 * here;
             0.5 * bend / (STEP * STEP)
         });
-        let (size, time, cross) = (size.max(0.0), time.max(0.0), 0.5 * (both - size - time));
-        let determinant = (1.0 + size) * (1.0 + time) - cross * cross;
-        x.iter().map(|x| x * x).sum::<f64>() + determinant.max(1.0).ln()
+        [size.max(0.0), time.max(0.0), 0.5 * (both - size - time)]
     }
 
     /// The same noise with the most probable zero flow; `unlikelihood` is twice the negative log-likelihood of the residuals.
@@ -137,6 +182,7 @@ mod tests {
     use super::*;
     use crate::data::free::Free;
     use crate::data::motion::FlowPaths;
+    use crate::data::row_noise::RowNoise;
     use crate::data::whitener::Whitener;
     use crate::dot::dot;
 
@@ -161,7 +207,7 @@ mod tests {
         let still = NoiseModel::new(0.33, 1e-3, 0.030);
         let prior = Prior::new(400.0, 1e-3);
         let unlikelihood = |noise: &NoiseModel| {
-            let whitener = Whitener::new(noise, &present, None);
+            let whitener = Whitener::new(noise, &present, &RowNoise::default());
             let flow = FlowPaths::new((0..series.len()).map(|k| k as f64).collect());
             let free = Free::new(noise, &whitener, &[], &flow, &[]);
             let mut e = vec![0.0; series.len()];

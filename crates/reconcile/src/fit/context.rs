@@ -2,7 +2,8 @@
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::position_error::Locking;
-use crate::problem::{Mask, Prepared, Problem};
+use crate::mask::Mask;
+use crate::problem::{Prepared, Problem};
 use crate::simulate::{Base, Effect, Input, Place, simulate};
 use crate::units::Scales;
 use cellpos_plant::effects::{Action, Candidate, Role, Scope, find};

@@ -6,7 +6,7 @@
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::linear::{Tangents, normal_equations};
-use crate::problem::Mask;
+use crate::mask::Mask;
 use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
 

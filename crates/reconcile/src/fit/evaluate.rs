@@ -3,7 +3,7 @@
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::{Columns, sum_squares};
-use crate::problem::Mask;
+use crate::mask::Mask;
 use cellpos_plant::effects::{FitParameter, Role};
 use std::f64::consts::TAU;
 

@@ -1,7 +1,7 @@
 //! Linear algebra of the fit: normal equations over masks, and projections against tangents.
 
 use crate::dot::dot;
-use crate::problem::Mask;
+use crate::mask::Mask;
 use nalgebra::{DMatrix, DVector};
 
 /// Columns of one record: (index of the parameter, whitened derivative).

@@ -257,6 +257,7 @@ fn tracks(ctx: &Context<'_>, fit: &Fit, at: usize) -> Vec<Track> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::row_noise::RowNoise;
 
     /// A walk seen with noise through an error of known size.
     fn track(noise: &NoiseModel, amplitude_um: f64, pixel_um: f64, rows: usize) -> Track {
@@ -285,7 +286,7 @@ mod tests {
         let t = track(&noise, 0.0, 0.25, 3000);
         let grid = Grid::new(&noise, [0.0; 2], 0.25).unwrap();
         let rows = grid.rows(&t, [0.0; 2], 0.25);
-        let w = crate::data::whitener::Whitener::new(&noise, &t.present, None);
+        let w = crate::data::whitener::Whitener::new(&noise, &t.present, &RowNoise::default());
         let mut e = vec![0.0; 3000];
         w.apply(&t.seen_um, &mut e);
         // The constants cancel between rows of the steady state.

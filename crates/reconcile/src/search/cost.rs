@@ -2,7 +2,7 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::problem::Mask;
+use crate::mask::Mask;
 use crate::thresholds::{CHANCE, CHANCE_SD, NUMBER, THRESHOLDS};
 use cellpos_plant::effects::{Action, Candidate};
 

@@ -3,7 +3,7 @@
 use crate::dot::dot;
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
-use crate::problem::Mask;
+use crate::mask::Mask;
 use crate::search::cost::threshold_of_waves;
 use cellpos_numeric::fft::{self, Complex};
 use cellpos_plant::effects::{FitParameter, Role};

@@ -5,7 +5,8 @@
 
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
-use crate::problem::{Mask, Prepared};
+use crate::mask::Mask;
+use crate::problem::Prepared;
 use crate::search::cost::threshold_of_waves;
 use crate::search::suspect::{Suspect, pair_score};
 use cellpos_numeric::fft;

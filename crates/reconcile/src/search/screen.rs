@@ -6,7 +6,7 @@
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
-use crate::problem::Mask;
+use crate::mask::Mask;
 use crate::search::lines::line_starts;
 use crate::search::pixel::pixel_scan;
 use crate::search::suspect::{Suspect, lines_score};

@@ -3,7 +3,7 @@
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
-use crate::problem::Mask;
+use crate::mask::Mask;
 use crate::search::cost::{
     before_forms, gap, least_gain, leaves_much, left_over, penalised_cost, threshold_of,
 };

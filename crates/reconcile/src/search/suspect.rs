@@ -3,7 +3,7 @@
 use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
-use crate::problem::Mask;
+use crate::mask::Mask;
 use cellpos_plant::effects::Role;
 use std::f64::consts::TAU;
 

@@ -13,11 +13,11 @@ use crate::verdict::counted::Counted;
 use crate::verdict::form::Aside;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge::{Evidence, judge};
-use crate::verdict::jumps::Jumps;
 use crate::verdict::map;
 use crate::verdict::names::names;
 use crate::verdict::proposal;
 use crate::verdict::result::{Gap, GapStep, Interval, Reconciliation, Traces, Verdict};
+use crate::verdict::searching::ByChance;
 use crate::verdict::sentences::sentences;
 use cellpos_plant::Model;
 use std::collections::BTreeMap;
@@ -27,7 +27,7 @@ pub(crate) struct Given<'a> {
     pub model: &'a Model,
     pub records: &'a [Record],
     pub frames: &'a FrameCounts,
-    pub jumps: Option<&'a Jumps>,
+    pub by_chance: &'a ByChance,
     pub floor: &'a Floor,
     pub threads: usize,
     /// What is to be said where the records hardly go with the model.
@@ -46,7 +46,7 @@ pub(crate) fn assemble(
         model,
         records,
         frames,
-        jumps,
+        by_chance,
         floor,
         threads,
         unlike,
@@ -64,7 +64,7 @@ pub(crate) fn assemble(
     let mut places: Vec<String> = unlike.map(str::to_owned).into_iter().collect();
     places.extend(sentences(ctx, &null, &null_map, floor.source.is_known()));
     let names = names(ctx, &null, &fit, &rivals, threads);
-    let counted = Counted::new(ctx, frames, jumps, left_over(&null));
+    let counted = Counted::new(ctx, frames, by_chance, left_over(&null));
     let gap = gap(ctx, &held, [&null, &fit], &steps, [&null_map, &after_map]);
     let judgement = judge(
         ctx,
@@ -88,7 +88,9 @@ pub(crate) fn assemble(
     let verdict = judgement.verdict;
     places.extend(counted.places);
     places.extend(judgement.reasons);
-    places.extend(slow_noise(ctx).or_else(|| zero_flow(ctx)));
+    if by_chance.wandering.is_none() {
+        places.extend(slow_noise(ctx).or_else(|| zero_flow(ctx)));
+    }
     if cut_short {
         places.push("the search ended with its budget of simulations, not because nothing more was to be found: --work 4 gives it four times as much".to_owned());
     }

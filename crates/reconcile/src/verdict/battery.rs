@@ -4,7 +4,7 @@
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
-use crate::problem::{Mask, split_in_time};
+use crate::mask::{Mask, split_in_time};
 use crate::search::lines::{Line, strongest_line, without_line};
 use crate::thresholds::THRESHOLDS;
 use crate::units::Side;
@@ -359,7 +359,7 @@ struct Selected {
 /// The formula for the innovations of a fit. A line with a separate amplitude and phase in every record is part of it if that says more. A
 /// wrong response also makes lines, of the command's sines, and its terms say as much.
 pub(crate) fn hypothesis(ctx: &Context<'_>, fit: &Fit, library: &[Column]) -> Option<Hypothesis> {
-    let (train, test) = split_in_time(&ctx.problem.records);
+    let (train, test) = split_in_time(ctx.problem.rows());
     let squares = |e: &[Vec<f64>]| inner(e, e, &test);
     let plain = selected(ctx, fit, library, None);
     let with_line = strongest_line(ctx, fit)
@@ -405,7 +405,7 @@ fn selected(
     library: &[Column],
     line: Option<Line>,
 ) -> Option<Selected> {
-    let (train, test) = split_in_time(&ctx.problem.records);
+    let (train, test) = split_in_time(ctx.problem.rows());
     let e = line.as_ref().map_or(&fit.innovations, |l| &l.left);
     // A base that was fitted to records of a plant that bends has another gain and lag than the plant: what these change is no term.
     let straight = straight(ctx, fit, library, &train);

@@ -1,10 +1,13 @@
-//! Effects that are counted, not fitted: missing and repeated frames, and jumps.
+//! Effects that come by chance, and are counted or belong to the noise: missing, repeated and late frames, and jumps.
 
 use crate::data::frames::{FrameCounts, wilson};
 use crate::fit::context::Context;
 use crate::verdict::jumps::{Jumps, rows_of_all};
+use crate::verdict::late_frames::LateFrames;
 use crate::verdict::result::{Effect as NamedEffect, Interval};
+use crate::verdict::searching::ByChance;
 use crate::verdict::significance;
+use crate::verdict::wandering::Wandering;
 use cellpos_plant::Effect;
 use cellpos_plant::effects;
 
@@ -21,13 +24,19 @@ impl Counted {
     pub(crate) fn new(
         ctx: &Context<'_>,
         frames: &FrameCounts,
-        jumps: Option<&Jumps>,
+        by_chance: &ByChance,
         gap: f64,
     ) -> Self {
         let mut out = Self::default();
         out.add_frames(frames);
-        if let Some(jumps) = jumps {
+        if let Some(jumps) = &by_chance.jumps {
             out.add_jumps(ctx, jumps, gap);
+        }
+        if let Some(late) = by_chance.late.filter(LateFrames::matters) {
+            out.add_late_frames(late, gap);
+        }
+        if let Some(wandering) = by_chance.wandering {
+            out.add_wandering(wandering, gap);
         }
         out
     }
@@ -89,6 +98,35 @@ impl Counted {
             self.places
                 .push(format!("{missing} of {} rows have no output", frames.rows));
         }
+    }
+
+    fn add_late_frames(&mut self, late: LateFrames, gap: f64) {
+        let half_s = 1.96 * late.error_s;
+        let interval = [(late.up_to_s - half_s).max(0.0), late.up_to_s + half_s];
+        let p_value = significance::p_value(late.gain, 1);
+        let explained = late.gain / (late.gain + gap.max(0.0));
+        let effect = effects::frame_jitter(late.up_to_s);
+        self.places.push(format!(
+            "{}: the error of the frames grows with the speed of the bead and differs from frame to frame",
+            effect.id(),
+        ));
+        self.add(effect, &[interval], (p_value, explained));
+    }
+
+    fn add_wandering(&mut self, w: Wandering, gap: f64) {
+        let interval = |(value, error): (f64, f64)| {
+            let factor = (1.96 * error).exp();
+            [value / factor, value * factor]
+        };
+        let p_value = significance::p_value(w.gain, 2);
+        let explained = w.gain / (w.gain + gap.max(0.0));
+        let effect = effects::flow_wander(w.um_per_s.0, w.time_s.0);
+        self.places.push(format!(
+            "{}: the bead drifts to and fro by itself, at rest too",
+            effect.id(),
+        ));
+        let intervals = [interval(w.um_per_s), interval(w.time_s)];
+        self.add(effect, &intervals, (p_value, explained));
     }
 
     fn add_jumps(&mut self, ctx: &Context<'_>, jumps: &Jumps, gap: f64) {

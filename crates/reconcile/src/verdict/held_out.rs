@@ -2,7 +2,8 @@
 //! a record by its beginning and the reverse.
 
 use crate::fit::context::{Context, Fit};
-use crate::problem::{Mask, Prepared, splits_of};
+use crate::mask::{Mask, splits_of};
+use crate::problem::Prepared;
 use crate::thresholds::THRESHOLDS;
 use crate::verdict::map::DiscrepancyMap;
 use crate::verdict::result::{BandGap, Interval, RecordGap};

@@ -3,7 +3,7 @@
 use crate::fit::catalogue::{Part, Variant};
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::Tangents;
-use crate::problem::Mask;
+use crate::mask::Mask;
 use crate::search::cost::threshold_of;
 use crate::units::figure;
 use cellpos_numeric::parallel;

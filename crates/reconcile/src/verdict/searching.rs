@@ -4,7 +4,6 @@ use crate::data::coloured::NoiseKind;
 use crate::data::floor::{Floor, error_of, refined};
 use crate::data::flow_loss::FlowLoss;
 use crate::data::noise::NoiseModel;
-use crate::data::zero_flow::Prior;
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit, WhiteEvidence, freedom_of};
 use crate::problem::Problem;
@@ -15,6 +14,8 @@ use crate::search::sequential::{search, within};
 use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
+use crate::verdict::late_frames::LateFrames;
+use crate::verdict::wandering::{Wandering, prior_of, suspected};
 use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
@@ -40,13 +41,21 @@ pub(super) struct Searched {
     pub problem: Problem,
 }
 
+/// What comes by chance, beside a set.
+#[derive(Default)]
+pub(crate) struct ByChance {
+    pub jumps: Option<Jumps>,
+    pub late: Option<LateFrames>,
+    pub wandering: Option<Wandering>,
+}
+
 impl Searching<'_> {
     /// What a fit of a problem needs; `trusted` increments told its noise.
     pub(super) fn context<'a>(&self, problem: &'a Problem, trusted: usize) -> Context<'a> {
         Context {
             problem,
             scope: self.scope,
-            fixed: self.fixed.to_vec(),
+            fixed: [self.fixed, &problem.mean].concat(),
             variants: catalogue::variants(self.own_effects),
             free_gain: self.free_gain,
             white: evidence(self.model, &problem.noise, trusted, problem),
@@ -110,19 +119,116 @@ impl Searching<'_> {
         }
     }
 
-    /// Searches, and once more with the position open where it jumps: the jumps of a bead, if there are any.
-    pub(super) fn beside_jumps(
+    /// Searches, and once more beside what comes by chance, if anything does: frames that are late, jumps of the bead.
+    pub(super) fn beside_chance(
         &self,
         problem: Problem,
         floor: &Floor,
         effort: Effort,
         progress: &mut dyn FnMut(&str),
+    ) -> (Searched, ByChance) {
+        let first = self.under_noise(problem.clone(), floor, effort, &mut *progress);
+        if problem.base.free_start || self.free_gain || !floor.source.is_known() {
+            return (first, ByChance::default());
+        }
+        let (late, problem, searched) =
+            self.beside_late_frames((first, problem), floor, effort, &mut *progress);
+        let (wandering, problem, searched) =
+            self.beside_wandering((searched, problem), floor, effort, &mut *progress);
+        let (searched, jumps) =
+            self.beside_jumps((searched, problem), floor, effort, &mut *progress);
+        let by_chance = ByChance {
+            jumps,
+            late,
+            wandering,
+        };
+        (searched, by_chance)
+    }
+
+    /// Searches once more with a flow that wanders by more than that of a rig, if that is more probable.
+    fn beside_wandering(
+        &self,
+        (searched, problem): (Searched, Problem),
+        floor: &Floor,
+        effort: Effort,
+        progress: &mut dyn FnMut(&str),
+    ) -> (Option<Wandering>, Problem, Searched) {
+        let ctx = self.context(&searched.problem, 0);
+        if !ctx.integrates() || !suspected(&ctx, &searched.found.fit) {
+            return (None, problem, searched);
+        }
+        progress("the flow wanders: once more with that noise");
+        let mut next = problem.clone();
+        next.wanders = true;
+        let again = self.under_noise(next.clone(), floor, effort, progress);
+        let cost = |s: &Searched| self.cost(&s.problem, &s.found.fit);
+        let gain = cost(&searched) - cost(&again);
+        let ctx = self.context(&again.problem, 0);
+        match Wandering::of(&ctx, &again.found.fit, gain).filter(|w| w.gain > NUMBER) {
+            Some(wandering) => (Some(wandering), next, again),
+            None => (None, problem, searched),
+        }
+    }
+
+    /// Searches once more with frames that are late by random times, if there are any and that is more probable.
+    fn beside_late_frames(
+        &self,
+        (mut searched, problem): (Searched, Problem),
+        floor: &Floor,
+        effort: Effort,
+        progress: &mut dyn FnMut(&str),
+    ) -> (Option<LateFrames>, Problem, Searched) {
+        const MOST_ROUNDS: usize = 3;
+        let cost = |s: &Searched| self.cost(&s.problem, &s.found.fit);
+        let (mut known, mut beside): (Option<LateFrames>, _) = (None, problem.clone());
+        let mut without = None;
+        for _ in 0..MOST_ROUNDS {
+            let ctx = self.context(&searched.problem, 0);
+            let found = LateFrames::find(&ctx, &searched.found.fit, known.as_ref());
+            let Some((late, speeds)) = found else {
+                return match without {
+                    Some(without) => (None, problem, without),
+                    None => (None, problem, searched),
+                };
+            };
+            if known.as_ref().is_some_and(|known| late.agrees(known)) {
+                known = Some(late);
+                break;
+            }
+            progress("frames are late by random times: once more with that noise");
+            let price = if known.is_none() { NUMBER } else { 0.0 };
+            let mut least = cost(&searched) - price;
+            let mut better = None;
+            for late in late.possible() {
+                let noise = (late.sd_s, late.mean());
+                let next = problem.clone().with_late_frames(noise, &speeds);
+                let again = self.under_noise(next.clone(), floor, effort, &mut *progress);
+                if cost(&again) < least {
+                    least = cost(&again);
+                    better = Some((late, next, again));
+                }
+            }
+            let Some((late, next, again)) = better else {
+                break;
+            };
+            (known, beside) = (Some(late), next);
+            let before = std::mem::replace(&mut searched, again);
+            without.get_or_insert(before);
+        }
+        (known, beside, searched)
+    }
+
+    /// Searches once more with the position open where it jumps: the jumps of a bead, if there are any.
+    fn beside_jumps(
+        &self,
+        (mut searched, problem): (Searched, Problem),
+        floor: &Floor,
+        effort: Effort,
+        progress: &mut dyn FnMut(&str),
     ) -> (Searched, Option<Jumps>) {
         const MOST_ROUNDS: usize = 3;
-        let of_bead = !problem.base.free_start && !self.free_gain && floor.source.is_known();
-        let mut searched = self.under_noise(problem.clone(), floor, effort, &mut *progress);
         let mut jumps = None;
-        for _ in 0..if of_bead { MOST_ROUNDS } else { 0 } {
+        for _ in 0..MOST_ROUNDS {
             let ctx = self.context(&searched.problem, 0);
             let more = Jumps::find(&ctx, &searched.found.fit);
             if more.count() == 0 {
@@ -309,11 +415,6 @@ impl Searching<'_> {
         penalised_cost(&self.context(problem, 0), fit) - fit.chi2
             + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
     }
-}
-
-/// Prior of the zero flow of the problem's rig.
-fn prior_of(problem: &Problem) -> Prior {
-    Prior::new(problem.base.speed_per_um(), problem.base.sample_s)
 }
 
 /// A set with the noise that it leaves, and their joint cost.

@@ -1,7 +1,7 @@
 //! Whether the numbers of a set are those of one equation: fitted to parts of the records, they must agree.
 
 use crate::fit::context::{Context, Fit};
-use crate::problem::Mask;
+use crate::mask::Mask;
 use crate::search::cost::threshold;
 use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;

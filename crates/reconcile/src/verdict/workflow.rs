@@ -162,7 +162,7 @@ fn within(
         },
         work: (options.work * WORK) as u64,
     };
-    let (searched, jumps) = searching.beside_jumps(problem, &floor, effort, &mut *progress);
+    let (searched, by_chance) = searching.beside_chance(problem, &floor, effort, &mut *progress);
     let Searched { mut found, problem } = searched;
     let ctx = searching.context(&problem, floor.rows);
     progress(&format!(
@@ -192,7 +192,7 @@ fn within(
         model: given,
         records: &records,
         frames: &frames,
-        jumps: jumps.as_ref(),
+        by_chance: &by_chance,
         floor: &floor,
         threads: options.threads,
         unlike: unlike.as_deref(),

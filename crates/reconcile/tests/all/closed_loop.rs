@@ -72,6 +72,8 @@ pub(super) enum Hidden {
     Line(f64, f64),
     /// Strokes that move the zero flow: Hz, and the size of the first of four multiples \[um\], the others less by their number.
     Pump(f64, f64),
+    /// Each frame is late by another time, at most this \[s\].
+    Jitter(f64),
 }
 
 impl Hidden {
@@ -110,6 +112,7 @@ impl Hidden {
             Self::GainDrift(r) => ("gain-drift", vec![("per_s", r)]),
             Self::Line(hz, um) => ("mains-hum", vec![("hz", hz), ("um", um)]),
             Self::Pump(hz, _) => ("pump-pulsation", vec![("hz", hz), ("second", 0.25)]),
+            Self::Jitter(up_to) => ("frame-jitter", vec![("up_to_s", up_to)]),
         }
     }
 }
@@ -141,7 +144,8 @@ impl Chain {
             | Hidden::Drops(_)
             | Hidden::Repeats(_)
             | Hidden::Line(..)
-            | Hidden::Pump(..) => u,
+            | Hidden::Pump(..)
+            | Hidden::Jitter(_) => u,
             Hidden::Gain(factor) => factor * u,
             Hidden::GainDrift(per_s) => {
                 s[0] += h;
@@ -317,6 +321,8 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
     let mut chain = Chain::new(hidden);
     let (mut stuck, mut last, mut before) = (0.0, 0.0, 0.0);
     let (mut t, mut u, mut y) = (Vec::new(), Vec::new(), Vec::new());
+    // Where the bead was in the steps of the last row, the latest last.
+    let mut past = [0.0; STEPS_A_ROW];
     for k in 0..ROWS {
         let now_s = k as f64 * ROW_S;
         let strokes_um = |hz: f64, um: f64| -> f64 {
@@ -352,7 +358,18 @@ pub(super) fn closed_loop(flow: Flow, hidden: Hidden, added: Added, seed: u64) -
                 if let Hidden::Shake(..) = hidden {
                     position += chain.state[2];
                 }
+                if let Hidden::Jitter(up_to_s) = hidden {
+                    let late = random.uniform() * up_to_s / step_s;
+                    let at = |steps: usize| match steps {
+                        0 => stuck,
+                        _ => past[STEPS_A_ROW - steps],
+                    };
+                    let (whole, part) = (late as usize, late.fract());
+                    position = at(whole) + part * (at(whole + 1) - at(whole));
+                }
             }
+            past.rotate_left(1);
+            past[STEPS_A_ROW - 1] = stuck;
             let bends = input - slow[0] * x[1] - slow[1] * x[0];
             x = [x[0] + step_s * x[1], x[1] + step_s * bends];
         }

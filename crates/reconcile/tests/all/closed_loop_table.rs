@@ -9,7 +9,7 @@ use cellpos_numeric::Random;
 use cellpos_plant::{Effect, effects};
 use cellpos_reconcile::{Options, Reconciliation, Record, Verdict};
 
-const ROWS: [Hidden; 28] = [
+const ROWS: [Hidden; 29] = [
     Hidden::Nothing,
     Hidden::Leak(2.0),
     Hidden::LeakAfterFlow(1.0),
@@ -38,6 +38,7 @@ const ROWS: [Hidden; 28] = [
     Hidden::Line(50.0, 0.1),
     Hidden::Pump(3.3, 0.1),
     Hidden::Pump(0.8, 0.02),
+    Hidden::Jitter(0.0006),
 ];
 
 fn flow_of(seed: u64) -> Flow {
@@ -193,6 +194,13 @@ fn a_hysteresis_that_is_a_gain_for_the_most_part_is_named_behind_a_stated_delay(
 fn a_chip_that_stiffens_with_the_square_is_named() {
     let progressive = Hidden::Progressive(0.4);
     assert!(row(progressive, &look_for(progressive, 433, 2)));
+}
+
+#[test]
+#[ignore = "nightly: two searches, a quarter of a minute of a release build"]
+fn frames_that_are_late_by_random_times_are_named_beside_the_delay_of_the_loop() {
+    let jitter = Hidden::Jitter(0.0006);
+    assert!(row(jitter, &look_for(jitter, 7, 2)));
 }
 
 #[test]
