@@ -133,10 +133,11 @@ impl Searching<'_> {
         }
         let (late, problem, searched) =
             self.beside_late_frames((first, problem), floor, effort, &mut *progress);
-        let (wandering, problem, searched) =
-            self.beside_wandering((searched, problem), floor, effort, &mut *progress);
-        let (searched, jumps) =
+        let (jumps, problem, searched) =
             self.beside_jumps((searched, problem), floor, effort, &mut *progress);
+        // A path with jumps is slow, too: what is left without them decides.
+        let (wandering, searched) =
+            self.beside_wandering((searched, problem), floor, effort, &mut *progress);
         let by_chance = ByChance {
             jumps,
             late,
@@ -152,21 +153,21 @@ impl Searching<'_> {
         floor: &Floor,
         effort: Effort,
         progress: &mut dyn FnMut(&str),
-    ) -> (Option<Wandering>, Problem, Searched) {
+    ) -> (Option<Wandering>, Searched) {
         let ctx = self.context(&searched.problem, 0);
         if !ctx.integrates() || !suspected(&ctx, &searched.found.fit) {
-            return (None, problem, searched);
+            return (None, searched);
         }
         progress("the flow wanders: once more with that noise");
-        let mut next = problem.clone();
+        let mut next = problem;
         next.wanders = true;
-        let again = self.under_noise(next.clone(), floor, effort, progress);
+        let again = self.under_noise(next, floor, effort, progress);
         let cost = |s: &Searched| self.cost(&s.problem, &s.found.fit);
         let gain = cost(&searched) - cost(&again);
         let ctx = self.context(&again.problem, 0);
         match Wandering::of(&ctx, &again.found.fit, gain).filter(|w| w.gain > NUMBER) {
-            Some(wandering) => (Some(wandering), next, again),
-            None => (None, problem, searched),
+            Some(wandering) => (Some(wandering), again),
+            None => (None, searched),
         }
     }
 
@@ -225,9 +226,9 @@ impl Searching<'_> {
         floor: &Floor,
         effort: Effort,
         progress: &mut dyn FnMut(&str),
-    ) -> (Searched, Option<Jumps>) {
+    ) -> (Option<Jumps>, Problem, Searched) {
         const MOST_ROUNDS: usize = 3;
-        let mut jumps = None;
+        let (mut jumps, mut open) = (None, problem.clone());
         for _ in 0..MOST_ROUNDS {
             let ctx = self.context(&searched.problem, 0);
             let more = Jumps::find(&ctx, &searched.found.fit);
@@ -242,16 +243,16 @@ impl Searching<'_> {
                 "the bead jumps in {} rows: once more without",
                 all.count()
             ));
-            let open = problem
+            open = problem
                 .clone()
                 .open_at(|record| all.rows_of(record).collect());
             jumps = Some(all);
-            searched = self.under_noise(open, floor, effort, &mut *progress);
+            searched = self.under_noise(open.clone(), floor, effort, &mut *progress);
         }
         if let Some(jumps) = &mut jumps {
             jumps.measure(&self.context(&searched.problem, 0), &searched.found.fit);
         }
-        (searched, jumps)
+        (jumps, open, searched)
     }
 
     /// Searches under the noise of the rig: a zero flow that moves, or, if that is more probable, one that stands still.
