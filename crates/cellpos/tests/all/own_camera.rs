@@ -69,7 +69,7 @@ fn a_bead_that_the_rig_file_does_not_describe_is_found_written_into_it_and_held(
         // To a held bead, through the frames.
         let held = succeed(
             at,
-            &format!("track --rig {name}.toml --target 1um --duration 2s --clock virtual --json"),
+            &format!("track --rig {name}.toml --target 1um --duration 3s --clock virtual --json"),
         )
         .json();
         let rms_nm = number(&held, "rms_true_nm");
