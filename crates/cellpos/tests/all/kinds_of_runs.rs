@@ -137,7 +137,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
     let learn = "--sine 2um@20Hz --learn --duration 6s --name learned";
     let cut = made(
         at,
-        &format!("track --target 1um --duration 10s --name cut {FAST}"),
+        &format!("track --target 1um --duration 20s --name cut {FAST}"),
     );
     killed(&cut, 0.8);
     let bare = made(
