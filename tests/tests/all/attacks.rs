@@ -29,7 +29,8 @@ fn damaged_inputs_get_an_answer() {
 
 #[test]
 fn a_hostile_camera_costs_no_tick_its_record() {
-    stands(attack::cameras::hostile_cameras, 6);
+    // On the virtual clock.
+    stands_beside_others(attack::cameras::hostile_cameras, 6);
 }
 
 #[test]

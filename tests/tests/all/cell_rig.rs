@@ -52,7 +52,7 @@ fn a_cell_is_followed_over_a_socket_against_a_background_recorded_before() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     write_rigs(at);
-    let track = "track --target 0um --duration 6s --json --rig";
+    let track = "track --target 0um --duration 4s --json --rig";
 
     let filming = RigInABox::start(at, &["--rig", "cell-box.toml"]);
     let text = error(&run(at, &format!("{track} unknown.toml")));

@@ -103,6 +103,7 @@ fn a_line_off_the_mains_is_unknown_with_a_formula_that_holds_on_held_out_data() 
 }
 
 #[test]
+#[ignore = "nightly: 10 s of a debug build; the fast one, in cellpos-reconcile, names an effect of the size that may hide"]
 fn a_leak_twice_above_the_threshold_is_named() {
     let weak = Hidden::Leak(0.08);
     let times = above_threshold(&[weak], Excitation::Standard, 13);

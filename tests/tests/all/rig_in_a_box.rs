@@ -77,11 +77,11 @@ fn fastest_um_per_s(rows: &[BoxRow]) -> f64 {
 fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_after() {
     let folder = tempfile::tempdir().unwrap();
     write_rig(folder.path(), 500.0);
-    let faults = ["--drop-frames", "0.2%", "--link-garbage", "2Hz"];
+    let faults = ["--drop-frames", "0.5%", "--link-garbage", "2Hz"];
     let rig = RigInABox::start(folder.path(), &faults);
     let output = cellpos(
         folder.path(),
-        "track --target 0um --rig rig.toml --duration 5s --json",
+        "track --target 0um --rig rig.toml --duration 3s --json",
     )
     .output()
     .unwrap();
@@ -96,14 +96,14 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
     );
     let r: Value = serde_json::from_str(&text).unwrap();
     assert_eq!(r["state"], "running", "{r}");
-    // Five seconds of the clock: a tick for each period, made or skipped.
+    // Three seconds of the clock: a tick for each period, made or skipped.
     let periods = r["ticks"].as_u64().unwrap() + r["skipped"].as_u64().unwrap();
     let by_the_clock = (r["duration_s"].as_f64().unwrap() * 1e3).round() as u64;
     // The run begins before its first frame, and that one may be waited for.
     assert!(periods <= by_the_clock + 1, "{r}");
     assert!(by_the_clock <= periods + 500, "{r}");
     // The tick that ends the run may itself be late.
-    assert!((5000..6000).contains(&periods), "{r}");
+    assert!((3000..4000).contains(&periods), "{r}");
     // On an idle machine 57 nm RMS, or 38 nm in the median, which the CPUs taken away for tens of milliseconds leave as it is.
     let median_nm = median_error_nm(&run_folder(folder.path()).unwrap());
     println!(
@@ -137,7 +137,7 @@ fn a_line_that_stalls_now_and_then_ends_no_run_and_its_lost_commands_are_counted
     let rig = RigInABox::start(folder.path(), &faults);
     let output = cellpos(
         folder.path(),
-        "track --target 0um --rig rig.toml --duration 8s --json",
+        "track --target 0um --rig rig.toml --duration 5s --json",
     )
     .output()
     .unwrap();

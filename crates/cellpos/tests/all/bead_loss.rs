@@ -195,9 +195,20 @@ fn a_bead_that_never_returns_ends_in_freeze_and_then_in_safe() {
 
 #[test]
 fn beside_a_second_bead_the_loop_never_changes_over_without_saying_so() {
+    beside_a_second_bead(&[1, 4, 6, 8]);
+}
+
+#[test]
+#[ignore = "nightly: eight distances; the fast one has four of them, from the nearest to the farthest"]
+fn beside_a_second_bead_at_any_distance_the_loop_never_changes_over_without_saying_so() {
+    beside_a_second_bead(&[1, 2, 3, 4, 5, 6, 7, 8]);
+}
+
+/// With these seeds, each with a distance of its own.
+fn beside_a_second_bead(seeds: &[u64]) {
     let folder = tempfile::tempdir().unwrap();
     let (mut accepted, mut refused) = (0_u32, 0_u32);
-    for seed in 1..=8_u64 {
+    for &seed in seeds {
         // It appears so near that the images overlap, or a little farther, and both diffuse.
         let second_um = [1.2, -1.3, 1.5, -1.6, 1.8, 2.2, -2.5, 3.0][(seed - 1) as usize];
         let faults = format!(
@@ -224,7 +235,7 @@ fn beside_a_second_bead_the_loop_never_changes_over_without_saying_so() {
     }
     println!("beside a second bead: {accepted} frames taken, {refused} not");
     // Never to take a frame would be safe and useless.
-    assert!(accepted > 8 * 1200, "{accepted} {refused}");
+    assert!(accepted > seeds.len() as u32 * 1200, "{accepted} {refused}");
 }
 
 #[test]

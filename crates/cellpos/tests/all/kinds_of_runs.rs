@@ -135,6 +135,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
     script(at);
     let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
     let learn = "--sine 2um@20Hz --learn --duration 6s --name learned";
+    // So long that a whole block of its records lies before the cut: half of it leaves no row.
     let cut = made(
         at,
         &format!("track --target 1um --duration 20s --name cut {FAST}"),

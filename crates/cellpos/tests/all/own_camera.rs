@@ -46,7 +46,7 @@ fn a_bead_that_the_rig_file_does_not_describe_is_found_written_into_it_and_held(
         }
         let found = succeed(
             at,
-            &format!("camera --rig {name}.toml --find-beads {name}.png --duration 2s --json"),
+            &format!("camera --rig {name}.toml --find-beads {name}.png --duration 1s --json"),
         )
         .json();
         let sight = &found["sight"];

@@ -1,7 +1,9 @@
 //! A rig in a closed loop whose zero flow moves: the command then holds what the flow did, and no effect may be made of it.
 
-use crate::closed_loop::{DELAY_S, Flow, Hidden, closed_loop, run, survey, tones};
-use cellpos_reconcile::{Reconciliation, Verdict};
+use crate::closed_loop::{
+    DELAY_S, Flow, Hidden, WORKING_POINT_UM, closed_loop, run, run_from, survey, tones,
+};
+use cellpos_reconcile::{Options, Reconciliation, Verdict};
 
 /// The names, of which the delay must be one, with its value.
 fn named(r: &Reconciliation) -> Vec<&str> {
@@ -75,6 +77,21 @@ fn the_traces_have_no_ramp(r: &Reconciliation) {
 
 #[test]
 fn a_leak_is_told_from_a_zero_flow_that_moves() {
+    // Both names and no search for a third.
+    let two = Options {
+        max_effects: 2,
+        ..Options::default()
+    };
+    leak_and_delay(&two);
+}
+
+#[test]
+#[ignore = "nightly: a third name is looked for as well; the fast one looks for two"]
+fn a_leak_beside_a_zero_flow_that_moves_leaves_nothing_to_name() {
+    leak_and_delay(&Options::default());
+}
+
+fn leak_and_delay(options: &Options) {
     // Where the rest is not known before: closed_loop_table.rs.
     let flow = Flow {
         wander_um: 0.006,
@@ -82,7 +99,7 @@ fn a_leak_is_told_from_a_zero_flow_that_moves() {
         drift_um_per_s: 0.001,
     };
     let record = closed_loop(flow, Hidden::Leak(2.0), survey, 71);
-    let r = run(record);
+    let r = run_from(record, WORKING_POINT_UM, options, Vec::new());
     let mut names = named(&r);
     names.sort_unstable();
     assert_eq!(names, ["leak", "time-delay"], "{:?}", r.places);

@@ -6,10 +6,20 @@ use crate::common::change::Picture;
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn two_cells_that_overlap_are_not_one_good_cell() {
+    overlap(&[0.35, 0.5, 0.8, 1.1]);
+}
+
+#[test]
+#[ignore = "nightly: every distance; the fast one has four of the eight, from the nearest that has a bound"]
+fn two_cells_that_overlap_are_not_one_good_cell_at_any_distance() {
+    overlap(&[0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.1, 1.4]);
+}
+
+/// Pairs at these distances of the middles, in mean widths, in five directions.
+fn overlap(distances: &[f64]) {
     for mut lab in SETS.map(Lab::open) {
         let cells = std::mem::take(&mut lab.cells);
-        // Distance of the middles over the mean width, and direction.
-        for apart in [0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.1, 1.4] {
+        for &apart in distances {
             let mut row = Row::default();
             for (n, known) in cells.iter().enumerate() {
                 let place = lab.set.middle(&known.cut);
@@ -83,8 +93,22 @@ fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn changed_frames() {
-    // Blur of the frame and its shift, px.
-    let rows = [
+    frames_changed_by(&[
+        ("as recorded", 0.0, 0.0, 0.0),
+        ("frame blurred 1", 1.0, 0.0, 0.0),
+        ("frame blurred 2", 2.0, 0.0, 0.0),
+        ("frame blurred 4", 4.0, 0.0, 0.0),
+        ("walls moved 3", 0.0, 1.34, 2.68),
+        ("walls moved -3 across", 0.0, 0.0, -3.0),
+        ("walls moved 3 along", 0.0, 3.0, 0.0),
+        ("moved 2, blurred 1", 1.0, 0.9, 1.79),
+    ]);
+}
+
+#[test]
+#[ignore = "nightly: every row of the table; the fast one has each kind of change, and the largest"]
+fn changed_frames_every_row() {
+    frames_changed_by(&[
         ("as recorded", 0.0, 0.0, 0.0),
         ("frame blurred 0.5", 0.5, 0.0, 0.0),
         ("frame blurred 1", 1.0, 0.0, 0.0),
@@ -98,9 +122,13 @@ fn changed_frames() {
         ("walls moved -3 across", 0.0, 0.0, -3.0),
         ("walls moved 3 along", 0.0, 3.0, 0.0),
         ("moved 2, blurred 1", 1.0, 0.9, 1.79),
-    ];
+    ]);
+}
+
+/// Rows of a name, blur of the frame and its shift, px.
+fn frames_changed_by(rows: &[(&str, f64, f64, f64)]) {
     for mut lab in SETS.map(Lab::open) {
-        for (what, blur, dx, dy) in rows {
+        for &(what, blur, dx, dy) in rows {
             let spoil = |p: Picture| blurred(&p, blur).moved(dx, dy);
             let moved = |_: &Cut, p: (f64, f64)| [p, (p.0 + dx, p.1 + dy)];
             let row = lab.row(what, Picture::clone, spoil, moved);
@@ -128,9 +156,20 @@ fn changed_frames() {
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn changed_cells() {
+    cells_changed_by(&[1.0, 6.0], &[3.0, 6.0], false);
+}
+
+#[test]
+#[ignore = "nightly: every row of the table; the fast one has each kind of change, and the rows that have a bound"]
+fn changed_cells_every_row() {
+    cells_changed_by(&[1.0, 2.0, 4.0, 6.0], &[3.0, 6.0, 10.0], true);
+}
+
+/// Cells out of focus and smeared by so many px; `untold`: also smears that the finder does not expect, which have no bound.
+fn cells_changed_by(focus_px: &[f64], smears_px: &[f64], untold: bool) {
     let still = |_: &Cut, p: (f64, f64)| [p, p];
     for mut lab in SETS.map(Lab::open) {
-        for px in [1.0, 2.0, 4.0, 6.0] {
+        for &px in focus_px {
             let what = format!("cell out of focus {px}");
             let row = lab.row(&what, |c| blurred(c, px), |p| p, still);
             // The area is that of another focus, or the stated error says that it may be.
@@ -140,9 +179,11 @@ fn changed_cells() {
                 lab.name
             );
         }
-        for px in [3.0, 6.0, 10.0] {
-            let what = format!("smeared {px} px");
-            lab.row(&what, |c| c.smeared(px), |p| p, still);
+        for &px in smears_px {
+            if untold {
+                let what = format!("smeared {px} px");
+                lab.row(&what, |c| c.smeared(px), |p| p, still);
+            }
             lab.finder.expect_smear((px, 0.0));
             let what = format!("smeared {px} px, told");
             let row = lab.row(&what, |c| c.smeared(px), |p| p, still);

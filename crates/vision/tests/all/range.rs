@@ -66,7 +66,8 @@ fn frame_of(
 
 #[test]
 fn the_tracker_says_that_the_settings_will_not_hold_before_it_loses_the_bead() {
-    ramps(|of, k| (of + k).is_multiple_of(2) && (of, k) != (0, 2));
+    // The widest profile takes most of the time: it has the ramp that no other has.
+    ramps(|of, k| [(0, 0), (1, 1), (1, 3), (2, 2)].contains(&(of, k)));
 }
 
 #[test]

@@ -331,25 +331,27 @@ fn the_whole_table_keeps_its_limits() {
     );
 }
 
-/// Each way to spoil a picture with settings from such pictures and from clean ones; kinds of beads and noise in turn.
-fn few_rows(take: impl Fn(usize) -> bool) {
+/// Each way to spoil a picture with settings from such pictures and from clean ones; kinds of beads and noise in turn, of the first
+/// `kinds`.
+fn few_rows(kinds: usize, take: impl Fn(usize) -> bool) {
     let rows = (0..24).filter(|k| take(*k)).map(|k| {
         let snr = [40.0, 10.0, 200.0][k % 3];
-        ((5 * k + k / 12) % 9, snr, SETTINGS[k / 12], ALL[k % 12])
+        let kind = (5 * k + k / 12) % 9 % kinds;
+        (kind, snr, SETTINGS[k / 12], ALL[k % 12])
     });
     run(&rows.collect::<Vec<_>>(), 100.0);
 }
 
 #[test]
 fn a_few_rows_of_the_table_keep_their_limits() {
-    // Each way once, the settings in turn.
-    few_rows(|k| (k + k / 12).is_multiple_of(2));
+    // Each way once, the settings in turn. Without the two kinds of the widest windows, which take half of the time.
+    few_rows(7, |k| (k + k / 12).is_multiple_of(2));
 }
 
 #[test]
 #[ignore = "slow: each way to spoil a picture with both settings; the fast one has each way once"]
 fn each_way_to_spoil_a_picture_with_both_settings_keeps_its_limits() {
-    few_rows(|_| true);
+    few_rows(9, |_| true);
 }
 
 #[test]

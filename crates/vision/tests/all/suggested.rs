@@ -167,6 +167,10 @@ fn rim_circle(frame: &Frame, (mut x, mut y): (f64, f64)) -> (f64, f64) {
 }
 
 #[test]
+#[cfg_attr(
+    not(no_shared_data),
+    ignore = "nightly: 8 s of a debug build; the fast ones see five measured beads in every frame, and compare the error with what is stated"
+)]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/trapped-bead")]
 fn a_trapped_bead_is_seen_in_every_frame_and_its_error_is_what_the_covariance_says() {
     let stack = trapped();
@@ -229,9 +233,20 @@ fn a_trapped_bead_is_seen_in_every_frame_and_its_error_is_what_the_covariance_sa
 
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/beads-brightfield")]
+fn a_size_given_a_fifth_too_large_is_put_right_by_learning() {
+    sizes_are_put_right(&[1.2]);
+}
+
+#[test]
+#[ignore = "nightly: the other way as well; the fast one has a size that is too large"]
 fn a_size_given_a_fifth_too_large_or_too_small_is_put_right_by_learning() {
+    sizes_are_put_right(&[0.8, 1.2]);
+}
+
+/// Sizes that are off by these factors.
+fn sizes_are_put_right(factors: &[f64]) {
     let stack = beads();
-    for factor in [0.8, 1.2] {
+    for &factor in factors {
         let spec = ProfileSpec::Ring {
             edge_px: factor * RingProfile::MEASURED_EDGE_PX,
         };

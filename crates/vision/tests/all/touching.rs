@@ -238,8 +238,19 @@ fn run_beside_one_that_leaves(seed: u64, flow: f64, outcome: &mut Outcome) {
 
 #[test]
 fn a_bead_whose_neighbour_has_left_the_picture_is_not_taken_for_it_when_the_flow_steps() {
+    beside_one_that_left(&[-1140.0, 3790.0]);
+}
+
+#[test]
+#[ignore = "nightly: a third flow; the fast one has either direction"]
+fn a_bead_whose_neighbour_has_left_the_picture_is_not_taken_for_it_whatever_the_flow() {
+    beside_one_that_left(&[1140.0, -1140.0, 3790.0]);
+}
+
+/// Flows that step by so many px/s.
+fn beside_one_that_left(flows: &[f64]) {
     let seeds = 5;
-    for flow in [1140.0, -1140.0, 3790.0] {
+    for &flow in flows {
         let mut outcome = Outcome::default();
         for seed in 1..=seeds as u64 {
             run_beside_one_that_leaves(seed * 7919, flow, &mut outcome);

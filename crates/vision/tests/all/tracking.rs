@@ -387,8 +387,19 @@ fn a_bead_among_beads_on_the_glass_is_followed_through_pulses_and_steps_of_the_f
 
 #[test]
 fn what_stands_in_the_picture_is_learnt_and_the_bead_swims_over_it() {
+    swims_over(2);
+}
+
+#[test]
+#[ignore = "nightly: four seeds; the fast one has two"]
+fn what_stands_in_the_picture_is_learnt_wherever_it_stands() {
+    swims_over(4);
+}
+
+/// Over what stands in the pictures of so many seeds.
+fn swims_over(seeds: u64) {
     let (mut refused, mut off, mut beside, mut frames) = (0, 0, 0, 0);
-    for seed in 1..=4 {
+    for seed in 1..=seeds {
         let mut random = Random(seed * 7919);
         let mut scene = Scene::new();
         // A speck of dust and a bead on the glass, half as strong as ours, are on the bead's way, and one of each elsewhere.

@@ -191,8 +191,8 @@ fn a_drift_of_50_um_an_hour_is_taken_up_and_the_hold_is_that_of_the_pzt_alone() 
         counts.range_limited + counts.partner_limited + counts.partner_lost,
         0
     );
-    // Alone the PZT is at the end of its stroke by then.
-    let lone = run(&drift, "lqg", hold(), 120.0);
+    // Alone the PZT is at the end of its stroke after three quarters of a minute.
+    let lone = run(&drift, "lqg", hold(), 60.0);
     assert!(lone.summary.counts.range_limited > 1000);
 }
 

@@ -265,8 +265,19 @@ fn clips_just_above(rows: &[(u64, &'static str, f64)]) {
 
 #[test]
 fn pi_pushes_less_and_is_held_beside_a_clip_or_ends_with_a_reason() {
+    // The first holds the bead, the next ends as clipped.
+    beside_a_clip(11..14);
+}
+
+#[test]
+#[ignore = "nightly: eight seeds; the fast one has three, with both ends among them"]
+fn pi_pushes_less_and_is_held_beside_a_clip_or_ends_with_a_reason_with_every_seed() {
+    beside_a_clip(11..19);
+}
+
+fn beside_a_clip(seeds: std::ops::Range<u64>) {
     // Of 32 seeds half end as clipped. A bead that leaves the view before that is known has strayed, and some runs hold it.
-    for seed in 11..19 {
+    for seed in seeds {
         let row = Row {
             seconds: 20.0,
             ideal: false,
