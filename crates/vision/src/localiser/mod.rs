@@ -338,6 +338,9 @@ impl Localiser {
         if whole || self.noise_variance.is_none() {
             self.read_noise();
         }
+        if self.comb.is_still() && let Some(f) = &fitted {
+            self.explain_noise(f);
+        }
         if !self.comb.is_still() {
             fitted = self.fit_length(view, fitted, side_px);
         }

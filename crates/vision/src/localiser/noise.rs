@@ -6,8 +6,6 @@ use crate::fit::{Pass, Weights};
 
 /// Degrees of freedom of the noise in the smallest window that a frame may hold, 5 x 5 px.
 const LEAST_FREEDOM: f64 = 8.0;
-/// A fit explains the border if it leaves less than this share of its variance: chance and specks take off less.
-const EXPLAINED: f64 = 0.3;
 
 impl Localiser {
     /// Puts the noise about the bead into force: that of its own window, as far as the windows of the last fixes differ.
@@ -27,7 +25,7 @@ impl Localiser {
     pub(super) fn explain_noise(&mut self, f: &Fitted) {
         if let PixelNoise::Estimated = self.config.noise {
             let (variance, freedom) = self.noise_left_by(f);
-            if variance < EXPLAINED * self.noise_here.0 {
+            if variance < self.noise_here.0 {
                 self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
                 self.noise_variance = Some(self.noises.moderate(variance, self.noise_here.1));
             }
