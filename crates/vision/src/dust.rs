@@ -363,7 +363,9 @@ impl Sums {
     /// are singular to the rounding of single precision, but the bead's place is known. The least damping that shows above it is enough.
     fn covariance(&self) -> Option<SMatrix<f64, ALL, ALL>> {
         let of = |damping| Some(self.damped(damping).cholesky()?.inverse());
-        of(0.0).or_else(|| of(ROUNDING)).or_else(|| of(100.0 * ROUNDING))
+        of(0.0)
+            .or_else(|| of(ROUNDING))
+            .or_else(|| of(100.0 * ROUNDING))
     }
 
     fn damped(&self, damping: f64) -> SMatrix<f64, ALL, ALL> {

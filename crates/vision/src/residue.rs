@@ -135,7 +135,12 @@ impl Residues {
         let mut now = widening_of(&scores, &Look::NONE.mean, inverse, relative * kept)?;
         if !is_new {
             // What the look has and this window has not, as a speck that is a part of the fit now, moves this fix by nothing.
-            now = now.min(widening_of(&scores, &look.mean, inverse, relative * own * kept)?);
+            now = now.min(widening_of(
+                &scores,
+                &look.mean,
+                inverse,
+                relative * own * kept,
+            )?);
         }
         let pool = &mut self.pooled[usize::from(!is_new)];
         if !again {

@@ -79,7 +79,10 @@ pub struct Localiser {
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
     local: Scales,
     /// The same of the score of the place, which counts alike errors of neighbours; and what it is for white noise.
-    scatter: Pool,
+    scatter: Scales,
+    mean_scatter: Pool,
+    /// By how much the score of this fix scatters more than white noise of its window.
+    scatter_here: f64,
     white_scatter: f64,
     lines: [Pool; 2],
     /// What the last fixes were widened by, and their residual ratios.
@@ -152,7 +155,9 @@ impl Localiser {
             shading_px2,
             filled,
             local: Scales::default(),
-            scatter: Pool::default(),
+            scatter: Scales::default(),
+            mean_scatter: Pool::default(),
+            scatter_here: 1.0,
             white_scatter,
             lines: [Pool::default(); 2],
             widened: Pool::default(),
@@ -338,7 +343,9 @@ impl Localiser {
         if whole || self.noise_variance.is_none() {
             self.read_noise();
         }
-        if self.comb.is_still() && let Some(f) = &fitted {
+        if self.comb.is_still()
+            && let Some(f) = &fitted
+        {
             self.explain_noise(f);
         }
         if !self.comb.is_still() {

@@ -161,13 +161,9 @@ impl Localiser {
         let gain = before - both.pass.chi2 / unit;
         both.speck.take_off(&mut self.crop);
         let parts = (both.pass.amplitude, both.pass.background);
-        let left = self.residues.lopsided(
-            &self.crop,
-            &self.template,
-            &self.comb,
-            both.place_px,
-            parts,
-        );
+        let left =
+            self.residues
+                .lopsided(&self.crop, &self.template, &self.comb, both.place_px, parts);
         if !dust::pays(&self.crop, radius_px, gain, left / variance, other) {
             both.speck.put_back(&mut self.crop);
             return None;
