@@ -54,6 +54,7 @@ impl Localiser {
                 is_draft: !alone,
                 ..View::of(frame)
             };
+            // What stands beside one bead says nothing of another.
             self.narrow_fixes = 0;
             let fix = self.locate_in(&view, (x, y));
             let apart =

@@ -28,11 +28,6 @@ const LEAST_ANSWER: f64 = 0.04;
 const POOLED_FIXES: f64 = 4.0;
 /// Share of fixes that something spoils which spoils no others, before the window is looked at.
 const SPOILT: f64 = 0.01;
-/// Degrees of freedom of the score's scatter, per squared bead radius, and the least. For a Gaussian in white noise, both directions: twice
-/// the square of the sum of the squared derivatives over the sum of their fourth powers, 8 pi / 3 times the variance, over the sum of
-/// Bartlett's squared weights, 4.46.
-const SCATTER_FREEDOM: f64 = 0.94;
-const LEAST_SCATTER_FREEDOM: f64 = 5.0;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
 const LEAST_EXPLAINED: f64 = 0.5;
 
@@ -234,21 +229,12 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         let parts = (fix.amplitude, background);
         let seen = observed::of(&self.crop, &self.template, (fix.x_px, fix.y_px), parts);
-        // In the noise that windows have in common, as what patches leave.
+        // In the noise that windows have in common: what is pooled would vary with that of each window.
         let variance = self.pixel_variance(fix.background);
         let common = self.noises.common().unwrap_or(variance);
-        let scatter = (seen.scatter / (self.white_scatter * common)).max(LEAST_LEFT);
-        let radius_px = self.template.radius_px();
-        let freedom = (SCATTER_FREEDOM * radius_px * radius_px).max(LEAST_SCATTER_FREEDOM);
-        self.scatter.take_in(scatter, freedom);
-        self.mean_scatter.take_in(scatter);
-        // The window of a narrow bead has too few pixels to tell its own: it is the mean of all.
-        let usual = if radius_px >= UNRESOLVED_PX {
-            self.scatter.moderate(scatter, freedom)
-        } else {
-            self.mean_scatter.mean
-        };
-        self.scatter_here = usual * common / variance;
+        self.scatter
+            .take_in(seen.scatter / (self.white_scatter * common));
+        self.scatter_here = self.scatter.mean * common / variance;
         seen.answer
     }
 
@@ -312,7 +298,7 @@ impl Localiser {
         }
         let radius_px = self.template.radius_px();
         if radius_px >= UNRESOLVED_PX {
-            return self.scatter_here.max(1.0);
+            return 1.0;
         }
         let usual = self.local.common().unwrap_or(1.0).max(1.0);
         let ratio = (own / usual).max(1.0);

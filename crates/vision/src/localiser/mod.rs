@@ -79,9 +79,8 @@ pub struct Localiser {
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
     local: Scales,
     /// The same of the score of the place, which counts alike errors of neighbours; and what it is for white noise.
-    scatter: Scales,
-    mean_scatter: Pool,
-    /// By how much the score of this fix scatters more than white noise of its window.
+    scatter: Pool,
+    /// By how much this fix's scatters more than for white noise of its window.
     scatter_here: f64,
     white_scatter: f64,
     lines: [Pool; 2],
@@ -155,8 +154,7 @@ impl Localiser {
             shading_px2,
             filled,
             local: Scales::default(),
-            scatter: Scales::default(),
-            mean_scatter: Pool::default(),
+            scatter: Pool::default(),
             scatter_here: 1.0,
             white_scatter,
             lines: [Pool::default(); 2],
@@ -343,19 +341,14 @@ impl Localiser {
         if whole || self.noise_variance.is_none() {
             self.read_noise();
         }
-        if self.comb.is_still()
-            && let Some(f) = &fitted
-        {
-            self.explain_noise(f);
-        }
-        if !self.comb.is_still() {
+        if self.comb.is_still() {
+            self.explain_noise(fitted.as_ref(), whole);
+        } else {
             fitted = self.fit_length(view, fitted, side_px);
         }
         let fitted = self.refine(view, fitted, (x_px, y_px), side_px);
         if whole {
-            if let Some(f) = &fitted {
-                self.explain_noise(f);
-            }
+            self.explain_noise(fitted.as_ref(), true);
             if !view.is_draft {
                 self.keep_noise();
             }

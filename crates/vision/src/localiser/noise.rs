@@ -20,14 +20,21 @@ impl Localiser {
         });
     }
 
-    /// Reads the noise off the residual of a fit if the bead makes most of the differences along the border: a bead that reaches the
-    /// border is no noise.
-    pub(super) fn explain_noise(&mut self, f: &Fitted) {
-        if let PixelNoise::Estimated = self.config.noise {
+    /// Reads the noise off the residual of a fit where that leaves less of the border: a bead that reaches the border is no noise there.
+    /// Of the two explanations, with the bead's light and without, the likelier one has the smaller variance. A window that is not whole
+    /// has no noise of its own. It is read in place of that of the last whole one, which may have a speck on its border.
+    pub(super) fn explain_noise(&mut self, f: Option<&Fitted>, is_whole: bool) {
+        if let (PixelNoise::Estimated, Some(f)) = (self.config.noise, f) {
             let (variance, freedom) = self.noise_left_by(f);
-            if variance < self.noise_here.0 {
-                self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
-                self.noise_variance = Some(self.noises.moderate(variance, self.noise_here.1));
+            let left = (variance, freedom.max(LEAST_FREEDOM));
+            let less = if left.0 < self.noise_here.0 {
+                left
+            } else {
+                self.noise_here
+            };
+            self.noise_variance = Some(self.noises.moderate(less.0, less.1));
+            if is_whole {
+                self.noise_here = less;
             }
         }
     }
