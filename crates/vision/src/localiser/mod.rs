@@ -341,10 +341,10 @@ impl Localiser {
         if whole || self.noise_variance.is_none() {
             self.read_noise();
         }
-        if self.comb.is_still() {
-            self.explain_noise(fitted.as_ref(), whole);
-        } else {
+        if !self.comb.is_still() {
             fitted = self.fit_length(view, fitted, side_px);
+        } else if !whole {
+            self.explain_noise(fitted.as_ref(), false);
         }
         let fitted = self.refine(view, fitted, (x_px, y_px), side_px);
         if whole {

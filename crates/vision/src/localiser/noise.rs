@@ -6,6 +6,8 @@ use crate::fit::{Pass, Weights};
 
 /// Degrees of freedom of the noise in the smallest window that a frame may hold, 5 x 5 px.
 const LEAST_FREEDOM: f64 = 8.0;
+/// A fit explains the border if it leaves less than this share of its variance: chance and specks take off less.
+const EXPLAINED: f64 = 0.3;
 
 impl Localiser {
     /// Puts the noise about the bead into force: that of its own window, as far as the windows of the last fixes differ.
@@ -20,14 +22,15 @@ impl Localiser {
         });
     }
 
-    /// Reads the noise off the residual of a fit where that leaves less of the border: a bead that reaches the border is no noise there.
-    /// Of the two explanations, with the bead's light and without, the likelier one has the smaller variance. A window that is not whole
-    /// has no noise of its own. It is read in place of that of the last whole one, which may have a speck on its border.
+    /// Reads the noise off the residual of a fit if the bead makes most of the differences along the border: a bead that reaches the
+    /// border is no noise. A window that is not whole has the bead on its border, and no noise of its own. It is read in place of that
+    /// of the last whole one, which may have a speck there: the smaller of the two is the likelier.
     pub(super) fn explain_noise(&mut self, f: Option<&Fitted>, is_whole: bool) {
+        let most = if is_whole { EXPLAINED } else { 1.0 };
         if let (PixelNoise::Estimated, Some(f)) = (self.config.noise, f) {
             let (variance, freedom) = self.noise_left_by(f);
             let left = (variance, freedom.max(LEAST_FREEDOM));
-            let less = if left.0 < self.noise_here.0 {
+            let less = if left.0 < most * self.noise_here.0 {
                 left
             } else {
                 self.noise_here
