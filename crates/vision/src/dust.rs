@@ -34,7 +34,10 @@ const BENT: [usize; 7] = [0, 1, 5, 6, 7, 8, 9];
 /// Passes of the fit, its first damping, and the misfit's relative change at rest.
 const MOST_PASSES: usize = 24;
 const DAMPING: f64 = 1e-2;
+const MOST_DAMPING: f64 = 1e6;
 const AT_REST: f64 = 1e-4;
+/// Relative error of a sum of numbers of single precision over a window.
+const ROUNDING: f64 = 1e-6;
 /// Longest step of a shape parameter relative to the larger one, and of the place in standard deviations.
 const LONGEST_STEP: f64 = 0.5;
 
@@ -223,7 +226,13 @@ pub(crate) fn fit(
     let mut rest = sums.at_rest()?;
     let mut damping = DAMPING;
     for _ in 0..MOST_PASSES {
-        let step = sums.step(damping)?;
+        let Some(step) = sums.step(damping) else {
+            damping *= 10.0;
+            if damping > MOST_DAMPING {
+                break;
+            }
+            continue;
+        };
         let (dx, dy) = (step[0] / step[2], step[1] / step[2]);
         let scale = (reach_px / f64::hypot(dx, dy).max(1e-12)).min(1.0);
         let next_at = (at.0 + scale * dx, at.1 + scale * dy);
@@ -231,7 +240,7 @@ pub(crate) fn fit(
         let next_sums = Sums::of(crop, template, next_at, &next, weights);
         let Some(found) = next_sums.at_rest().filter(|found| found.0 < rest.0) else {
             damping *= 10.0;
-            if damping > 1e6 {
+            if damping > MOST_DAMPING {
                 break;
             }
             continue;
@@ -245,7 +254,7 @@ pub(crate) fn fit(
     }
     let (chi2, linear) = rest;
     speck.contrast = linear[4];
-    let inverse = sums.normal.cholesky()?.inverse();
+    let inverse = sums.covariance()?;
     let amplitude = linear[2];
     let pass = Pass {
         step_x_px: 0.0,
@@ -347,11 +356,24 @@ impl Sums {
 
     /// The damped step.
     fn step(&self, damping: f64) -> Option<SVector<f64, ALL>> {
+        Some(self.damped(damping).cholesky()?.solve(&self.right))
+    }
+
+    /// Covariance of all parameters. The flank of a speck whose middle is far out of the window does not tell its shape: the equations
+    /// are singular to the rounding of single precision, but the bead's place is known. The least damping that shows above it is enough.
+    fn covariance(&self) -> Option<SMatrix<f64, ALL, ALL>> {
+        let of = |damping| Some(self.damped(damping).cholesky()?.inverse());
+        of(0.0)
+            .or_else(|| of(ROUNDING))
+            .or_else(|| of(100.0 * ROUNDING))
+    }
+
+    fn damped(&self, damping: f64) -> SMatrix<f64, ALL, ALL> {
         let mut normal = self.normal;
         for i in BENT {
             normal[(i, i)] *= 1.0 + damping;
         }
-        Some(normal.cholesky()?.solve(&self.right))
+        normal
     }
 }
 
@@ -361,13 +383,13 @@ pub(crate) fn alike_px(radius_px: f64) -> f64 {
     (core::f64::consts::PI * 0.25 * radius_px * radius_px).max(1.0)
 }
 
-/// Whether a speck explains enough: what it takes off the sum of squares (`before` to `after`, variances of noise) beyond the price
+/// Whether a speck explains enough: what it takes off the sum of squares (`gain`, variances of noise) beyond the price
 /// of its parameters, that is their number times the logarithm of the number of pixels (Schwarz 1978), and beyond what `other`
-/// parameters would take off. What the fit leaves beyond noise is a template's error, alike over patches of half a bead radius: there a
-/// patch counts as one pixel.
-pub(crate) fn pays(crop: &Crop, radius_px: f64, before: f64, after: f64, other: f64) -> bool {
+/// parameters would take off. What the fit leaves beyond noise besides its mean all round (`lopsided`, variances of noise a pixel) is a
+/// template's error, alike over patches of half a bead radius: there a patch counts as one pixel. The mean all round is no speck's.
+pub(crate) fn pays(crop: &Crop, radius_px: f64, gain: f64, lopsided: f64, other: f64) -> bool {
     let pixels = (crop.width * crop.height) as f64;
-    let excess = (after / (pixels - ALL as f64) - 1.0).max(0.0);
+    let excess = (lopsided - 1.0).max(0.0);
     let price = OWN as f64 * pixels.ln() * (1.0 + alike_px(radius_px) * excess);
-    before - after > price + other
+    gain > price + other
 }

@@ -130,10 +130,18 @@ impl Residues {
         let known = f64::from(look.fixes);
         let forgetting = (1.0 / (known + 1.0)).max(LOOK_FORGETTING);
         let is_new = look.fixes == 0 || again;
-        let own = if is_new { 1.0 } else { 1.0 + forgetting };
-        let mean = if is_new { &Look::NONE.mean } else { &look.mean };
+        let own = 1.0 + forgetting;
         let kept = INTERPOLATED + (1.0 - INTERPOLATED) * common;
-        let now = widening_of(&scores, mean, inverse, relative * own * kept)?;
+        let mut now = widening_of(&scores, &Look::NONE.mean, inverse, relative * kept)?;
+        if !is_new {
+            // What the look has and this window has not, as a speck that is a part of the fit now, moves this fix by nothing.
+            now = now.min(widening_of(
+                &scores,
+                &look.mean,
+                inverse,
+                relative * own * kept,
+            )?);
+        }
         let pool = &mut self.pooled[usize::from(!is_new)];
         if !again {
             for (mean, score) in look.mean.iter_mut().zip(&scores) {

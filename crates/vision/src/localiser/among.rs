@@ -54,6 +54,8 @@ impl Localiser {
                 is_draft: !alone,
                 ..View::of(frame)
             };
+            // What stands beside one bead says nothing of another.
+            self.narrow_fixes = 0;
             let fix = self.locate_in(&view, (x, y));
             let apart =
                 |f: &Fix| squared(f.x_px - fix.x_px, f.y_px - fix.y_px) >= radius_px * radius_px;
@@ -89,6 +91,7 @@ impl Localiser {
                     is_draft: round < ROUNDS,
                     ..View::of(frame)
                 };
+                self.narrow_fixes = 0;
                 let fix = self.locate_in(&view, (own.x_px, own.y_px));
                 let off_px = f64::hypot(fix.x_px - own.x_px, fix.y_px - own.y_px);
                 if off_px < radius_px || round == ROUNDS {

@@ -229,8 +229,12 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         let parts = (fix.amplitude, background);
         let seen = observed::of(&self.crop, &self.template, (fix.x_px, fix.y_px), parts);
-        let white = self.white_scatter * self.pixel_variance(fix.background);
-        self.scatter.take_in(seen.scatter / white);
+        // In the noise that windows have in common: what is pooled would vary with that of each window.
+        let variance = self.pixel_variance(fix.background);
+        let common = self.noises.common().unwrap_or(variance);
+        self.scatter
+            .take_in(seen.scatter / (self.white_scatter * common));
+        self.scatter_here = self.scatter.mean * common / variance;
         seen.answer
     }
 
@@ -304,7 +308,7 @@ impl Localiser {
         } else {
             1.0
         };
-        self.scatter.mean.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
+        self.scatter_here.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
     }
 
     /// Part of the whole window that the bead fills, for the tolerance of a template's error: see [`filled`].

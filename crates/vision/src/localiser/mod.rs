@@ -80,6 +80,8 @@ pub struct Localiser {
     local: Scales,
     /// The same of the score of the place, which counts alike errors of neighbours; and what it is for white noise.
     scatter: Pool,
+    /// By how much this fix's scatters more than for white noise of its window.
+    scatter_here: f64,
     white_scatter: f64,
     lines: [Pool; 2],
     /// What the last fixes were widened by, and their residual ratios.
@@ -153,6 +155,7 @@ impl Localiser {
             filled,
             local: Scales::default(),
             scatter: Pool::default(),
+            scatter_here: 1.0,
             white_scatter,
             lines: [Pool::default(); 2],
             widened: Pool::default(),
@@ -340,12 +343,12 @@ impl Localiser {
         }
         if !self.comb.is_still() {
             fitted = self.fit_length(view, fitted, side_px);
+        } else if !whole {
+            self.explain_noise(fitted.as_ref(), false);
         }
         let fitted = self.refine(view, fitted, (x_px, y_px), side_px);
         if whole {
-            if let Some(f) = &fitted {
-                self.explain_noise(f);
-            }
+            self.explain_noise(fitted.as_ref(), true);
             if !view.is_draft {
                 self.keep_noise();
             }

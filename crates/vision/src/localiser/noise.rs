@@ -23,13 +23,21 @@ impl Localiser {
     }
 
     /// Reads the noise off the residual of a fit if the bead makes most of the differences along the border: a bead that reaches the
-    /// border is no noise.
-    pub(super) fn explain_noise(&mut self, f: &Fitted) {
-        if let PixelNoise::Estimated = self.config.noise {
+    /// border is no noise. A window that is not whole has the bead on its border, and no noise of its own. It is read in place of that
+    /// of the last whole one, which may have a speck there: the smaller of the two is the likelier.
+    pub(super) fn explain_noise(&mut self, f: Option<&Fitted>, is_whole: bool) {
+        let most = if is_whole { EXPLAINED } else { 1.0 };
+        if let (PixelNoise::Estimated, Some(f)) = (self.config.noise, f) {
             let (variance, freedom) = self.noise_left_by(f);
-            if variance < EXPLAINED * self.noise_here.0 {
-                self.noise_here = (variance, freedom.max(LEAST_FREEDOM));
-                self.noise_variance = Some(self.noises.moderate(variance, self.noise_here.1));
+            let left = (variance, freedom.max(LEAST_FREEDOM));
+            let less = if left.0 < most * self.noise_here.0 {
+                left
+            } else {
+                self.noise_here
+            };
+            self.noise_variance = Some(self.noises.moderate(less.0, less.1));
+            if is_whole {
+                self.noise_here = less;
             }
         }
     }

@@ -158,11 +158,16 @@ impl Localiser {
         let at = (f.x_px, f.y_px);
         let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
         let other = f.left.explained_by_slope_and_size() / variance;
-        let after = both.pass.chi2 / unit;
-        if !dust::pays(&self.crop, radius_px, before, after, other) {
+        let gain = before - both.pass.chi2 / unit;
+        both.speck.take_off(&mut self.crop);
+        let parts = (both.pass.amplitude, both.pass.background);
+        let left =
+            self.residues
+                .lopsided(&self.crop, &self.template, &self.comb, both.place_px, parts);
+        if !dust::pays(&self.crop, radius_px, gain, left / variance, other) {
+            both.speck.put_back(&mut self.crop);
             return None;
         }
-        both.speck.take_off(&mut self.crop);
         let (x_px, y_px) = both.place_px;
         let found = Fitted {
             x_px,

@@ -405,6 +405,13 @@ fn a_profile_is_learnt_as_far_as_the_image_of_a_bead_reaches() {
 }
 
 #[test]
+fn a_speck_beside_one_bead_is_no_noise_of_the_next() {
+    // A speck on the border of one window must not be the noise of the windows after it.
+    let rows = [(6, 200.0, Settings::Right, Spoil::Dust)];
+    run_with(&rows, 100.0, &(0.7..1.4));
+}
+
+#[test]
 #[ignore = "28 s of a debug build: for .ci/nightly"]
 fn specks_beside_some_beads_widen_no_others() {
     // A few windows with specks in them must carry neither the noise nor the scatter that is stated for all.
