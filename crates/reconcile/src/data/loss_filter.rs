@@ -36,13 +36,13 @@ impl Gains {
         p.fixed_view_mut::<2, 2>(1, 1)
             .copy_from(&chip.at_rest(z.motion_um2, z.keep()));
         let mut begun = false;
-        for k in 0..present.len() {
+        for (k, seen) in present.iter().enumerate() {
             if k > 0 {
                 p = step * p * step.transpose();
                 p[(1, 1)] += z.fresh_um2();
             }
             p[(0, 0)] += noise.walk_um2 + rows.walk_um2(k);
-            if !present[k] {
+            if !seen {
                 continue;
             }
             if !begun {

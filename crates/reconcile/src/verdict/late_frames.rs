@@ -331,7 +331,7 @@ impl Left<'_> {
             covariance = bend.cholesky()?.inverse();
             x -= covariance * slope;
             // Beyond that the likelihood is no parabola.
-            if !(x[0].abs() < 0.5) {
+            if x[0].is_nan() || x[0].abs() > 0.5 {
                 return None;
             }
         }
