@@ -95,6 +95,11 @@ pub trait Block: fmt::Debug + Send + Sync {
         true
     }
 
+    /// Whether it changes its state at some speed: only short steps tell the time of that.
+    fn switches(&self) -> bool {
+        false
+    }
+
     /// The slope of the output for a slope of the input \[um/s\]; for blocks that never stop the motion.
     fn speed(&self, time_s: f64, input_um_per_s: f64) -> f64 {
         let _ = time_s;

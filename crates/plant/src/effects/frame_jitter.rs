@@ -1,5 +1,6 @@
 //! `frame-jitter`: each frame is late by a random time.
 
+use super::time_delay::time_delay;
 use super::{Action, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Shown, Spec};
 use cellpos_numeric::Random;
 
@@ -10,6 +11,11 @@ pub fn frame_jitter(up_to_s: f64) -> Effect {
 
 /// The smallest that matters: at 100 um/s it moves a fix by 3 nm RMS \[s\].
 pub const FRAME_JITTER_LEAST_S: f64 = 1e-4;
+
+/// What it does to the mean of the positions: a delay.
+pub fn frame_jitter_mean(up_to_s: f64) -> Effect {
+    time_delay(0.5 * up_to_s)
+}
 
 #[derive(Debug)]
 pub(super) struct FrameJitter;

@@ -61,7 +61,7 @@ pub use exposure_averaging::exposure_averaging;
 pub use flow_drift::flow_drift;
 pub use flow_wander::flow_wander;
 pub use frame_drops::frame_drops;
-pub use frame_jitter::{FRAME_JITTER_LEAST_S, frame_jitter};
+pub use frame_jitter::{FRAME_JITTER_LEAST_S, frame_jitter, frame_jitter_mean};
 pub use frame_repeats::frame_repeats;
 pub use gain_drift::gain_drift;
 pub use gain_error::gain_error;

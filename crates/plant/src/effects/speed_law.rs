@@ -21,6 +21,11 @@ pub(crate) trait SpeedLaw: fmt::Debug + Clone + Send + Sync + 'static {
         speed
     }
 
+    /// As [`Block::switches`].
+    fn switches(&self) -> bool {
+        false
+    }
+
     /// Back to rest.
     fn reset(&mut self) {}
 }
@@ -76,6 +81,10 @@ impl<L: SpeedLaw> Block for OfSpeed<L> {
 
     fn needs_slopes(&self) -> bool {
         true
+    }
+
+    fn switches(&self) -> bool {
+        self.law.switches()
     }
 
     fn speed(&self, _: f64, input_um_per_s: f64) -> f64 {

@@ -81,31 +81,66 @@ struct Stick {
     stuck: bool,
 }
 
+impl Stick {
+    /// Where a speed that changes linearly from `a` to `b` next lets the bead go or stops it, from the part `from` of the piece on.
+    fn change(&self, from: f64, a: f64, b: f64) -> Option<f64> {
+        let now = a + (b - a) * from;
+        // A bead that is stuck goes at either sign; one that moves stops on its side of zero.
+        let (passed, limit) = if self.stuck {
+            (
+                now.abs() >= self.break_um_per_s,
+                self.break_um_per_s.copysign(b - a),
+            )
+        } else {
+            (
+                now.abs() < self.stop_um_per_s,
+                self.stop_um_per_s.copysign(now),
+            )
+        };
+        if passed {
+            return Some(from);
+        }
+        let at = (limit - a) / (b - a);
+        let towards = self.stuck || (b - a) * now < 0.0;
+        (towards && at > from && at < 1.0).then_some(at)
+    }
+}
+
 impl SpeedLaw for Stick {
     fn travel(&mut self, moved: f64, a: f64, b: f64, h_s: f64) -> f64 {
+        // A reversal stops the bead and may let it go again within one piece.
+        const MOST_CHANGES: usize = 4;
+        // What the bead moved beyond the straight line of its speed is spread evenly.
+        let beyond = moved - 0.5 * (a + b) * h_s;
+        let moved = |from: f64, until: f64| {
+            (until - from) * (beyond + h_s * (a + 0.5 * (b - a) * (from + until)))
+        };
+        let (mut from, mut sum) = (0.0, 0.0);
+        for _ in 0..MOST_CHANGES {
+            let change = self.change(from, a, b);
+            let until = change.unwrap_or(1.0);
+            if !self.stuck {
+                sum += moved(from, until);
+            }
+            if change.is_none() {
+                return sum;
+            }
+            self.stuck = !self.stuck;
+            from = until;
+        }
         if self.stuck {
-            // It breaks free within the piece, when the speed passes the threshold.
-            let limit = self.break_um_per_s;
-            if a.abs() >= limit {
-                self.stuck = false;
-                return moved;
-            }
-            if b.abs() > limit {
-                self.stuck = false;
-                let f = (limit - a.abs()) / (b.abs() - a.abs());
-                return 0.5 * (limit.copysign(b) + b) * (1.0 - f) * h_s;
-            }
-            return 0.0;
+            sum
+        } else {
+            sum + moved(from, 1.0)
         }
-        // A speed that passes zero passes the lower threshold as well.
-        if b.abs() < self.stop_um_per_s || a * b < 0.0 {
-            self.stuck = true;
-        }
-        moved
     }
 
     fn speed(&self, speed: f64) -> f64 {
         if self.stuck { 0.0 } else { speed }
+    }
+
+    fn switches(&self) -> bool {
+        true
     }
 
     fn reset(&mut self) {

@@ -191,7 +191,7 @@ impl<'a> Chain<'a> {
                     chain.before.push(Stage::Block(block));
                 }
                 Action::Block(block) => {
-                    if spec.place == Place::Chip {
+                    if spec.place == Place::Chip || block.switches() {
                         chain.fine = chain.fine.max(4);
                     }
                     chain.motion.push(block);

@@ -6,7 +6,7 @@
 use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{NUMBER, THRESHOLDS};
 
 /// Standard deviations of one chance in a thousand, both ways.
 const ONE_IN_A_THOUSAND: f64 = 3.29;
@@ -69,7 +69,9 @@ impl Jumps {
             // An exposure during which it came shows a part of it.
             let [step, edge] = [of(row, e.len()), of(row, row + 1)];
             let gain = gain_of(&step, &e);
-            if gain < THRESHOLDS.jump_sd.powi(2).max(gain_of(&edge, &e)) {
+            // Noise with tails has bad fixes by the hundred, and by chance the next rows of some look a little like a step.
+            let as_bad_fix = gain_of(&edge, &e) + NUMBER;
+            if gain < THRESHOLDS.jump_sd.powi(2).max(as_bad_fix) {
                 continue;
             }
             let [um, part_um] = fitted([&step, &edge], &e);

@@ -54,7 +54,7 @@ impl LateFrames {
 
     /// What they do to the mean of the positions, and the error of that by what the scatter says \[s\].
     pub(crate) fn mean(&self) -> (Option<Effect>, f64) {
-        let mean = (self.delays).then(|| effects::time_delay(0.5 * self.up_to_s));
+        let mean = (self.delays).then(|| effects::frame_jitter_mean(self.up_to_s));
         (mean, 0.5 * EVEN * self.sd_error_s)
     }
 
@@ -162,7 +162,7 @@ fn speeds(ctx: &Context<'_>, fit: &Fit, spread_s: f64) -> Vec<Vec<f64>> {
     let all = ctx.problem.all();
     let at = |late_s: f64| {
         let mut fixed = ctx.fixed.clone();
-        fixed.push(effects::time_delay(late_s));
+        fixed.push(effects::frame_jitter_mean(2.0 * late_s));
         let shifted = Context {
             fixed,
             ..ctx.clone()

@@ -22,11 +22,13 @@ fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
 
 /// What a text says of an effect by its name: the id as a string, or the function that makes it.
 fn named_in(code: &str) -> Vec<&'static str> {
-    // Missing and repeated frames and jumps are counted and not searched: the counts say which effect they are.
+    // What comes by chance is counted or belongs to the noise, and is not searched: the counts and the noise say which effect it is.
     let counted = [
         effects::frame_drops(0.0).id(),
         effects::frame_repeats(0.0).id(),
         effects::jumps(0.0, 0.0).id(),
+        effects::frame_jitter(0.0).id(),
+        effects::flow_wander(0.0, 1.0).id(),
     ];
     let names = |id: &&str| {
         let made = format!("effects::{}(", id.replace('-', "_"));
