@@ -16,7 +16,7 @@ impl RowNoise {
     }
 
     /// Further variance of the position in row `k` \[um^2\].
-    pub(crate) fn white_um2(&self, k: usize) -> f64 {
+    pub(super) fn white_um2(&self, k: usize) -> f64 {
         self.white.as_ref().map_or(0.0, |w| w[k])
     }
 }

@@ -259,15 +259,13 @@ impl Left<'_> {
     /// Whether the lateness of a frame says nothing of that of the next ones, nor of any mean.
     fn independent(&self, sd_s: f64) -> bool {
         let (e, _) = self.innovations(&self.ctx.problem.noise, Of::Frame, sd_s);
-        // The part of each innovation that lateness has, with the sign of the speed.
-        let rest = self.records().zip(&e).map(|((r, _, v), e)| {
-            let rows = Self::rows(Of::Frame, r, v, sd_s);
-            let white_um2 = self.ctx.problem.noise.white_um2;
-            let share = |k: usize| {
-                let own = rows.white_um2(k);
-                (own / (own + white_um2)).sqrt() * v[k].signum()
-            };
-            (0..e.len()).map(|k| share(k) * e[k]).collect::<Vec<f64>>()
+        // The part of each innovation that lateness has, with the sign of the speed. White noise alone is no measure: an exposure takes as much
+        // of the walk off as there is of it.
+        let floor_um2 = self.ctx.problem.noise.innovation_um().powi(2);
+        let rest = self.records().zip(&e).map(|((.., v), e)| {
+            let share = |v: &f64| v * sd_s / ((v * sd_s).powi(2) + floor_um2).sqrt();
+            let rest = v.iter().zip(e).map(|(v, e)| share(v) * e);
+            rest.collect::<Vec<f64>>()
         });
         let rest: Vec<Vec<f64>> = rest.collect();
         (1..=APART).all(|apart| {
