@@ -168,9 +168,9 @@ fn drawn_cases_differ_by_seed_and_are_the_same_for_one() {
 #[test]
 #[ignore = "26 s of a debug build: for .ci/nightly"]
 fn a_stranger_of_a_seed_gets_no_name_and_a_noise_that_is_slow_or_in_steps_none_either() {
-    let turbulence = Hidden::Stranger(Stranger::Turbulence(0.05));
+    let telegraph = Hidden::Stranger(Stranger::Telegraph(0.12, 3.0));
     let cases = [
-        Case::new("stranger", vec![turbulence], Session::DRAWN),
+        Case::new("stranger", vec![telegraph], Session::DRAWN),
         nulls(4)[1].clone(),
         nulls(4)[3].clone(),
     ];

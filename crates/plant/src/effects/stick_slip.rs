@@ -64,7 +64,8 @@ impl EffectKind for StickSlip {
     }
 
     fn starts(&self, _: usize, _: &Scope) -> Vec<Vec<f64>> {
-        grid(&[12.0, 30.0, 75.0], &[3.0, 10.0])
+        // Close to each other: between two speeds of release the likelihood is not smooth.
+        grid(&[12.0, 18.0, 27.0, 40.0, 60.0, 90.0], &[3.0, 10.0])
     }
 
     fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
