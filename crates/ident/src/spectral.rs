@@ -4,7 +4,7 @@
 //! H1 is biased in closed loop, because the input carries the output's noise. For records with a known excitation use
 //! [`crate::frequency_response`].
 
-use cellpos_numeric::fft;
+use cellpos_numeric::{fft, golden_section};
 use nalgebra::Complex;
 
 use crate::frequency_response::FrequencyPoint;
@@ -52,7 +52,7 @@ pub fn find_lines(signal: &[f64], period_s: f64, most: usize) -> Lines {
             fit_block(signal, 0, n, period_s, &trial, LEVELS)
                 .map_or(f64::INFINITY, |b| b.residual_variance)
         };
-        let refined = golden(peak - bin, peak + bin, &cost);
+        let refined = golden_section(peak - bin, peak + bin, 1e-7, cost);
         let after = cost(refined);
         if left - after < 5e-4 * total {
             break;
@@ -142,28 +142,6 @@ fn strongest(residual: &[f64], period_s: f64) -> Option<f64> {
     let best = (1..spectrum.len().saturating_sub(1))
         .max_by(|&a, &b| spectrum[a].norm_sqr().total_cmp(&spectrum[b].norm_sqr()))?;
     Some(best as f64 / (residual.len() as f64 * period_s))
-}
-
-fn golden(low: f64, high: f64, cost: &impl Fn(f64) -> f64) -> f64 {
-    let ratio = 0.618_033_988_749_894_8;
-    let (mut a, mut b) = (low, high);
-    let (mut c, mut d) = (b - ratio * (b - a), a + ratio * (b - a));
-    let (mut at_c, mut at_d) = (cost(c), cost(d));
-    for _ in 0..40 {
-        if at_c < at_d {
-            (b, d, at_d) = (d, c, at_c);
-            c = b - ratio * (b - a);
-            at_c = cost(c);
-        } else {
-            (a, c, at_c) = (c, d, at_d);
-            d = a + ratio * (b - a);
-            at_d = cost(d);
-        }
-        if b - a < 1e-7 * (high - low) {
-            break;
-        }
-    }
-    0.5 * (a + b)
 }
 
 /// Response by averaged spectra (H1, Hann windows overlapping by half, each stretch detrended), `stretch` rows each. Points whose

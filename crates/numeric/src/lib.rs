@@ -1,5 +1,5 @@
 //! Numerical tools shared by all crates: [`units`], seeded random numbers, order [`statistics`], distributions, the [`fft`],
-//! and a [`parallel`] map.
+//! the [`golden_section`], and a [`parallel`] map.
 //!
 //! Each tool exists only here, so that two crates cannot disagree about the meaning of a quantile or a seed. This is not a statistics
 //! library: distribution functions come from `statrs`.
@@ -13,9 +13,11 @@
 #![forbid(unsafe_code)]
 
 pub mod fft;
+mod golden_section;
 pub mod parallel;
 mod random;
 pub mod statistics;
 pub mod units;
 
+pub use golden_section::golden_section;
 pub use random::Random;

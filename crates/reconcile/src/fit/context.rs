@@ -98,6 +98,11 @@ impl Fit {
             .sum()
     }
 
+    /// How many numbers the parts before this one have: the place of its own in the covariance.
+    pub(crate) fn numbers_before(&self, index: usize) -> usize {
+        self.parts[..index].iter().map(|p| p.theta.len()).sum()
+    }
+
     /// How many parts before this one act in the way that it does.
     pub(crate) fn nth_of_role(&self, index: usize) -> usize {
         let of = |part: &Part| std::mem::discriminant(&part.variant().role);
@@ -122,7 +127,7 @@ impl Fit {
     /// Whether a part is a limit of its form: one of its numbers is at the end of its range, or may have any value in it.
     pub(crate) fn is_limit(&self, index: usize) -> bool {
         let part = &self.parts[index];
-        let before: usize = self.parts[..index].iter().map(|p| p.theta.len()).sum();
+        let before = self.numbers_before(index);
         let numbers = part.variant().params.iter().zip(&part.theta).enumerate();
         numbers.into_iter().any(|(j, (p, x))| {
             let (low, high) = (p.coordinate(p.lower), p.coordinate(p.upper));

@@ -104,7 +104,7 @@ impl Counted {
         let half_s = 1.96 * late.error_s;
         let interval = [(late.up_to_s - half_s).max(0.0), late.up_to_s + half_s];
         let p_value = significance::p_value(late.gain, 1);
-        let explained = late.gain / (late.gain + gap.max(0.0));
+        let explained = part_of(gap, late.gain);
         let effect = effects::frame_jitter(late.up_to_s);
         self.places.push(format!(
             "{}: the error of the frames grows with the speed of the bead and differs from frame to frame",
@@ -119,7 +119,7 @@ impl Counted {
             [value / factor, value * factor]
         };
         let p_value = significance::p_value(w.gain, 2);
-        let explained = w.gain / (w.gain + gap.max(0.0));
+        let explained = part_of(gap, w.gain);
         let effect = effects::flow_wander(w.um_per_s.0, w.time_s.0);
         self.places.push(format!(
             "{}: the bead drifts to and fro by itself, at rest too",
@@ -146,8 +146,13 @@ impl Counted {
             largest.row as f64 * ctx.problem.base.sample_s,
         ));
         let p_value = significance::p_value(jumps.gain, jumps.count());
-        let explained = jumps.gain / (jumps.gain + gap.max(0.0));
+        let explained = part_of(gap, jumps.gain);
         let size = [(um - half_um).max(0.0), um + half_um];
         self.add(effect, &[rate, size], (p_value, explained));
     }
+}
+
+/// Part of the excess that such a gain explains, if the others leave `gap` without any effect.
+fn part_of(gap: f64, gain: f64) -> f64 {
+    gain / (gain + gap.max(0.0))
 }

@@ -9,6 +9,7 @@ use crate::dot::dot;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;
 use crate::thresholds::{CHANCE_SD, NUMBER};
+use cellpos_numeric::golden_section;
 use cellpos_plant::Effect;
 use cellpos_plant::effects::{self, Action};
 use nalgebra::{Matrix3, Vector3};
@@ -120,17 +121,16 @@ impl LateFrames {
         fit: &Fit,
         (known, delay_error_s): (Option<&Self>, f64),
     ) -> Self {
-        let mut before = 0;
         let known = known.filter(|known| known.delays);
         let mut delay = known.map(|known| (0.5 * known.up_to_s, 0.5 * known.error_s));
-        for part in &fit.parts {
+        for (i, part) in fit.parts.iter().enumerate() {
             if let Action::Delay(delay_s) = part.effect(&ctx.scope).act() {
                 let slope = part.variant().params[0];
-                let sd = fit.covariance[(before, before)].max(0.0).sqrt();
+                let at = fit.numbers_before(i);
+                let sd = fit.covariance[(at, at)].max(0.0).sqrt();
                 let error_s = if slope.log { delay_s * sd } else { sd }.max(delay_error_s);
                 delay = Some((delay_s + delay.map_or(0.0, |(known_s, _)| known_s), error_s));
             }
-            before += part.theta.len();
         }
         let Some((delay_s, error_s)) = delay else {
             // What stands for a delay may be a lag, under noise that knows of no lateness.
@@ -342,22 +342,14 @@ impl Left<'_> {
 
 /// Where a function of a scale is least, and its value there. Steps of a factor of two, then the golden section.
 fn least(low: f64, high: f64, value: impl Fn(f64) -> f64) -> (f64, f64) {
-    const GOLDEN: f64 = 0.618_033_988_749_894_9;
+    const TOLERANCE: f64 = 7e-3;
     let steps = (high / low).log2().ceil() as i32;
     let coarse = (0..=steps).map(|i| low * 2f64.powi(i));
     let best = coarse
         .map(|x| (x, value(x)))
         .min_by(|a, b| a.1.total_cmp(&b.1));
     let at = best.map_or(low, |(x, _)| x).ln();
-    let (mut a, mut b) = (at - std::f64::consts::LN_2, at + std::f64::consts::LN_2);
-    while b - a > 1e-2 {
-        let (c, d) = (b - GOLDEN * (b - a), a + GOLDEN * (b - a));
-        if value(c.exp()) < value(d.exp()) {
-            b = d;
-        } else {
-            a = c;
-        }
-    }
-    let x = (0.5 * (a + b)).exp();
+    let (a, b) = (at - std::f64::consts::LN_2, at + std::f64::consts::LN_2);
+    let x = golden_section(a, b, TOLERANCE, |x| value(x.exp())).exp();
     (x, value(x))
 }

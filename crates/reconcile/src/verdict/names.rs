@@ -94,7 +94,7 @@ fn alternatives(
 /// Whether a rival explains as much with one of its times or rates at the end of its range, where it is a simpler effect. A relaxation that
 /// takes longer than a zero flow stands still is a gain.
 fn ends_as_well(ctx: &Context<'_>, fit: &Fit, index: usize, rival: &Rival) -> bool {
-    let before: usize = fit.parts[..index].iter().map(|p| p.theta.len()).sum();
+    let before = fit.numbers_before(index);
     let params = rival.part.variant().params.iter().enumerate();
     params.filter(|(_, p)| p.log).any(|(j, p)| {
         [p.lower, p.upper].into_iter().any(|end| {

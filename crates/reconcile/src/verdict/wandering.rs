@@ -35,7 +35,7 @@ pub(crate) fn suspected(ctx: &Context<'_>, fit: &Fit) -> bool {
         return false;
     }
     let (residual, _) = ctx.residual(fit);
-    let of_rig = Prior::new(problem.base.speed_per_um(), problem.base.sample_s);
+    let of_rig = prior_of(problem);
     let of_wandering = of_rig.of_wandering();
     let unlikelihood = |noise: &NoiseModel| problem.unlikelihood(noise, &residual);
     let wandering = of_wandering.estimate(&problem.noise, unlikelihood);
