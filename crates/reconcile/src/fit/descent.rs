@@ -6,6 +6,7 @@
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::linear::{Tangents, normal_equations};
+use crate::fit::waves;
 use crate::mask::Mask;
 use cellpos_plant::effects::Role;
 use nalgebra::{DMatrix, DVector};
@@ -234,15 +235,15 @@ impl Context<'_> {
                 break;
             }
         }
-        fit.chi2 = state.chi2;
+        let inverse = covariance(&normal);
         fit.last_gain = gained;
         fit.innovations = if mask.iter().any(Vec::is_empty) {
             self.state(&fit, &self.problem.all()).innovations
         } else {
             state.innovations
         };
+        fit.chi2 = state.chi2 + waves::unequal(&fit, &inverse);
         fit.log_information = log_information(normal.clone(), &self.ranges(&fit, size));
-        let inverse = covariance(&normal);
         let sd = |i: usize| inverse[(i, i)].max(0.0).sqrt();
         fit.errors = if self.free_gain {
             [sd(size - 2), sd(size - 1)]

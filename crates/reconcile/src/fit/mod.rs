@@ -9,3 +9,4 @@ mod evaluate;
 pub(crate) mod linear;
 pub(crate) mod locking;
 mod position_error;
+mod waves;

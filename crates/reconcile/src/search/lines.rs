@@ -88,11 +88,10 @@ struct Spectra {
     /// From one frequency to the next, Hz, and how many of these steps tell two lines apart.
     step_hz: f64,
     apart: usize,
-    records: f64,
     /// Of all records.
     whole: Vec<f64>,
-    /// That of the simulated response and of its distortions.
-    response: Vec<f64>,
+    /// Of each record: that of the innovations, and that of the simulated response and of its distortions.
+    records: Vec<[Vec<f64>; 2]>,
     /// Of the parts of each record, with their share of the rows.
     parts: Vec<(f64, Vec<f64>)>,
 }
@@ -127,7 +126,7 @@ impl Spectra {
             Some((count as f64, powers))
         };
         let (mut whole, mut parts, mut count) = (vec![0.0; kept], Vec::new(), 0.0);
-        let mut response = vec![0.0; kept];
+        let mut records = Vec::with_capacity(fit.innovations.len());
         let add = |sum: &mut [f64], power: &[f64]| {
             sum.iter_mut().zip(power).for_each(|(sum, x)| *sum += x);
         };
@@ -138,10 +137,12 @@ impl Spectra {
             let (own, power) = spectrum(e, ranges, 0..e.len())?;
             count += own;
             add(&mut whole, &power);
+            let mut response = vec![0.0; kept];
             for distorted in distortions(simulated).iter().filter(|d| !d.is_empty()) {
                 let whitened = record.whitened(distorted);
                 add(&mut response, &spectrum(&whitened, ranges, 0..e.len())?.1);
             }
+            records.push([power, response]);
             for k in 0..PARTS_OF_RECORD {
                 let part = k * e.len() / PARTS_OF_RECORD..(k + 1) * e.len() / PARTS_OF_RECORD;
                 parts.push(spectrum(e, ranges, part)?);
@@ -153,15 +154,14 @@ impl Spectra {
         Some(Self {
             step_hz,
             apart: bins.div_ceil(rows),
-            records: fit.innovations.len() as f64,
             whole,
-            response,
+            records,
             parts,
         })
     }
 
-    /// Power around a frequency, over that of white noise: the median on both sides.
-    fn background(&self, powers: &[f64], bin: usize) -> f64 {
+    /// Power around a frequency in a sum of spectra, over that of white noise: the median on both sides.
+    fn background(&self, powers: &[f64], spectra: usize, bin: usize) -> f64 {
         let below = bin.saturating_sub(BESIDE * self.apart)..bin.saturating_sub(self.apart);
         let above = bin + self.apart + 1..bin + BESIDE * self.apart + 1;
         let mut beside: Vec<f64> = (below.chain(above).step_by(self.apart))
@@ -172,21 +172,24 @@ impl Spectra {
         }
         let middle = beside.len() / 2;
         let (_, median, _) = beside.select_nth_unstable_by(middle, f64::total_cmp);
-        // Of chi-square with two degrees of freedom a record (Wilson and Hilferty).
-        let white = 2.0 * self.records * (1.0 - 1.0 / (9.0 * self.records)).powi(3);
+        // Of chi-square with two degrees of freedom a spectrum (Wilson and Hilferty).
+        let spectra = spectra as f64;
+        let white = 2.0 * spectra * (1.0 - 1.0 / (9.0 * spectra)).powi(3);
         *median / white
     }
 
     /// Whether a line stands out of what is beside it, `least` times white noise. Innovations have more there where the noise is slow or a
-    /// response is missing. If the response or a distortion of it has a line there as well, its equation, which is not exactly nature's, may
-    /// leave a part of that.
+    /// response is missing. Where the response of a record, or a distortion of it, has a line as well, its equation may leave a part of
+    /// that, for it is not exactly nature's: such a record says nothing. In a loop the command answers a line, and the others tell it.
     fn stands_out(&self, bin: usize, least: f64) -> bool {
-        let (Some(itself), Some(response)) = (self.whole.get(bin), self.response.get(bin)) else {
-            return false;
+        let own = |[power, response]: &[Vec<f64>; 2]| {
+            let (power, left) = (power.get(bin)?, MISFIT * response.get(bin)?);
+            let answers = response[bin] > least * self.background(response, 1, bin);
+            (!answers || *power >= left).then_some(*power)
         };
-        let answers = *response > least * self.background(&self.response, bin);
-        *itself > least * self.background(&self.whole, bin).max(1.0)
-            && !(answers && *itself < MISFIT * response)
+        let itself: f64 = self.records.iter().filter_map(own).sum();
+        let background = self.background(&self.whole, self.records.len(), bin);
+        itself > least * background.max(1.0)
     }
 
     /// The frequency, Hz, that gains most together with its multiples, `harmonics` in all. It has to stand out itself, because the halves
