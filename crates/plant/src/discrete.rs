@@ -258,16 +258,6 @@ impl DiscretePlant {
 
     /// The zeros in z of the strictly proper form `y_k = C x_k + D u_(k-1)`, by magnitude.
     pub fn zeros(&self) -> Vec<Complex<f64>> {
-        self.numerator_zeros(false)
-    }
-
-    /// The zeros in z of the biproper form `y_k = C x_k + D u_k`, which differs from a camera's record. It shows why that form
-    /// must not be inverted (Eq. (6) at 1 ms: z = -19.3).
-    pub fn biproper_zeros(&self) -> Vec<Complex<f64>> {
-        self.numerator_zeros(true)
-    }
-
-    fn numerator_zeros(&self, biproper: bool) -> Vec<Complex<f64>> {
         // N(z) = D [z] prod(z - p) + sum (w (early + late z)) prod others, over z prod(z - p).
         let poles = self.poles();
         let product = |skip: Option<usize>| {
@@ -288,9 +278,8 @@ impl DiscretePlant {
         let n = poles.len();
         // Ascending index = descending power; degree n + 1.
         let mut numerator = vec![Complex::new(0.0, 0.0); n + 2];
-        let offset = if biproper { 0 } else { 1 };
         for (k, c) in product(None).iter().enumerate() {
-            numerator[k + offset] += c * self.feedthrough;
+            numerator[k + 1] += c * self.feedthrough;
         }
         let mut index = 0;
         for m in &self.modes {
@@ -316,11 +305,9 @@ impl DiscretePlant {
             .map(|&c| if c.abs() < 1e-14 * largest { 0.0 } else { c })
             .collect();
         let mut zeros = roots::roots(&cleaned);
-        if !biproper || self.feedthrough == 0.0 {
-            // For a delay of whole samples, the factor z cancels against the pole at the origin.
-            if let Some(i) = zeros.iter().position(|z| z.norm() == 0.0) {
-                zeros.remove(i);
-            }
+        // For a delay of whole samples, the factor z cancels against the pole at the origin.
+        if let Some(i) = zeros.iter().position(|z| z.norm() == 0.0) {
+            zeros.remove(i);
         }
         zeros
     }

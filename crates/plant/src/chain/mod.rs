@@ -98,7 +98,6 @@ pub struct Chain {
 struct Brownian {
     diffusion_um2_per_s: f64,
     gaussian: Random,
-    on: bool,
 }
 
 impl Chain {
@@ -148,16 +147,8 @@ impl Chain {
         chain.brownian = Some(Brownian {
             diffusion_um2_per_s: model.noise.diffusion_um2_per_s,
             gaussian: Random::new(seed),
-            on: true,
         });
         Ok(chain)
-    }
-
-    /// Switches Brownian motion off and on again (a chain made without it has none to switch on).
-    pub fn set_brownian_motion(&mut self, on: bool) {
-        if let Some(b) = &mut self.brownian {
-            b.on = on;
-        }
     }
 
     /// Keeps the integral of the bead position from now on, for exposures.
@@ -299,7 +290,6 @@ impl Chain {
             self.area_um_s += signal.integral + h_s * self.offset_um;
         }
         if let Some(b) = &mut self.brownian
-            && b.on
             && h_s > 0.0
         {
             let variance = 2.0 * b.diffusion_um2_per_s * h_s;
@@ -354,10 +344,5 @@ impl Chain {
             }
         }
         speed
-    }
-
-    /// Sets the bead's position, um: another bead is chosen, or the origin is moved.
-    pub fn place_bead(&mut self, bead_um: f64) {
-        self.offset_um += bead_um - self.bead_um();
     }
 }
