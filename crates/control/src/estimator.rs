@@ -175,19 +175,9 @@ impl Estimator {
         })
     }
 
-    /// The configuration it was built from.
-    pub fn config(&self) -> &EstimatorConfig {
-        &self.config
-    }
-
     /// The plant it was built for.
     pub fn model(&self) -> &LoopModel {
         &self.model
-    }
-
-    /// Ticks by which a frame may be late and still be used at its own time.
-    pub fn longest_lag(&self) -> usize {
-        self.longest_lag
     }
 
     /// A state at rest: every past command was `command_um`, neutral is believed to be `neutral_um`, no bead seen.

@@ -258,23 +258,6 @@ impl Simulator {
         y
     }
 
-    /// Restarts at rest at the working point, at row 0. The random numbers are not restarted.
-    pub fn reset(&mut self) {
-        self.chain.reset();
-        self.note_rest();
-        self.row = 0;
-    }
-
-    /// The number of rows so far.
-    pub fn row(&self) -> usize {
-        self.row
-    }
-
-    /// The rig from the command to the bead, for its true positions.
-    pub fn chain(&self) -> &Chain {
-        &self.chain
-    }
-
     /// The response to a record that starts at row 0, written to `bead_um`; the shorter of the two lengths counts.
     pub fn run(&mut self, pzt_um: &[f64], sampled: Sampled, bead_um: &mut [f64]) {
         for (u, y) in pzt_um.iter().zip(bead_um) {

@@ -359,11 +359,6 @@ impl RunWriter {
         &self.folder
     }
 
-    /// The run's metadata as written.
-    pub fn meta(&self) -> &RunMeta {
-        &self.meta
-    }
-
     /// Adds conditions that are known only during the run; they are written at the end.
     pub fn add_conditions(&mut self, conditions: toml::Table) {
         self.meta.conditions.extend(conditions);

@@ -126,20 +126,6 @@ impl HeatMap {
         }
     }
 
-    /// Fixes the values at which the colours end; without it they follow the data.
-    #[must_use]
-    pub fn range(mut self, low: f64, high: f64) -> Self {
-        self.range = (low.is_finite() && high.is_finite() && low < high).then_some((low, high));
-        self
-    }
-
-    /// Decimals of the numbers written in the cells (default 1).
-    #[must_use]
-    pub fn decimals(mut self, decimals: usize) -> Self {
-        self.decimals = decimals.min(9);
-        self
-    }
-
     /// Value of a cell, if there is one.
     pub(crate) fn value(&self, row: usize, column: usize) -> Option<f64> {
         self.values

@@ -156,29 +156,6 @@ impl Chain {
         self.wants_area = true;
     }
 
-    /// Returns to rest at the working point at time 0, with the bead at 0 um, or where equations that replace the plant begin. The random
-    /// numbers are not restarted.
-    pub fn reset(&mut self) {
-        for stage in &mut self.compiled.stages {
-            match stage {
-                Stage::Linear(group) => group.reset(),
-                Stage::Block(block) => block.reset(),
-                Stage::Tied(tied) => tied.reset(),
-            }
-        }
-        for group in &mut self.compiled.bypass {
-            group.reset();
-        }
-        self.time_s = 0.0;
-        self.command_um = 0.0;
-        self.driver_um = 0.0;
-        self.beside_um = 0.0;
-        self.output = Piece::default();
-        self.offset_um = 0.0;
-        self.area_um_s = 0.0;
-        self.rest();
-    }
-
     /// Applies the initial level of equations that replace the plant: if it is not 0, it exists before the first command.
     fn rest(&mut self) {
         let begins = |s: &Stage| matches!(s, Stage::Tied(tied) if tied.replaces_output());
@@ -326,11 +303,6 @@ impl Chain {
             _ => self.driver_um,
         };
         self.working_point_um + reached
-    }
-
-    /// The displacement that the driver demands from the PZT after saturation and slew limit, um, absolute.
-    pub fn driver_um(&self) -> f64 {
-        self.working_point_um + self.driver_um
     }
 
     /// The speed of the flow that carries the bead, um/s, before adhesion holds the bead back.

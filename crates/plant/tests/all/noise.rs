@@ -109,19 +109,6 @@ fn row_by_row_and_whole_records_are_the_same_to_the_bit() {
         assert_eq!(simulator.measure().to_bits(), y.to_bits());
         simulator.hold(*u);
     }
-    assert_eq!(simulator.row(), 200);
-}
-
-#[test]
-fn a_chain_that_is_reset_is_at_rest_and_keeps_its_command() {
-    let mut chain = Chain::with_brownian_motion(&Model::eq6(), 4).unwrap();
-    chain.advance(4.0, 1e-3);
-    assert!(chain.bead_um() != 0.0);
-    chain.reset();
-    assert_eq!(
-        (chain.bead_um(), chain.time_s(), chain.pzt_um()),
-        (0.0, 0.0, 4.0)
-    );
 }
 
 #[test]
