@@ -384,11 +384,6 @@ impl RunWriter {
         self.log.flush();
     }
 
-    /// The data that could not be written so far.
-    pub fn faults(&self) -> Faults {
-        self.log.faults()
-    }
-
     /// Rows that the disk has not confirmed, including those that still gather for the next flush. The time counts from
     /// the flush.
     pub fn unconfirmed(&self) -> Unconfirmed {

@@ -99,8 +99,6 @@ pub struct HeatMap {
     pub(crate) columns: Vec<String>,
     pub(crate) values: Vec<f64>,
     pub(crate) label: String,
-    pub(crate) range: Option<(f64, f64)>,
-    pub(crate) decimals: usize,
 }
 
 impl HeatMap {
@@ -121,8 +119,6 @@ impl HeatMap {
                 .collect(),
             values: values.to_vec(),
             label: label.to_owned(),
-            range: None,
-            decimals: 1,
         }
     }
 
