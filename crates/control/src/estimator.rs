@@ -3,7 +3,7 @@
 //! State: integrator position `q` and neutral `n` with their covariance; the fast modes are known functions of the
 //! commands. The filter stands at the time of the newest measurement it has used; the present is predicted from there
 //! through the commands since. A missing measurement just leaves the filter where it is (for up to
-//! [`Estimator::longest_lag`] ticks), so a late one is used at the time at which its frame was exposed, exactly.
+//! three ticks), so a late one is used at the time at which its frame was exposed, exactly.
 //!
 //! Brownian motion drives `q` with variance `2 D Ts` per tick, neutral is a random walk, and a relative uncertainty of
 //! the gain widens the covariance in proportion to the motion it predicts.
