@@ -2,7 +2,7 @@
 
 use crate::control_loop::{ControlLoop, LoopState};
 use crate::error::BuildError;
-use crate::estimator::{EstimatorConfig, EstimatorState};
+use crate::estimator::EstimatorConfig;
 use crate::feedforward::BRAKING_TICKS;
 use crate::law::{ControlLaw, LAW_COLUMNS};
 use crate::linear::LinearLaw;
@@ -55,7 +55,6 @@ trait AnyLoop: std::fmt::Debug + Send {
     fn skip(&mut self);
     fn rest_at(&mut self, zero_flow_um: f64, variance_um2: f64);
     fn start_estimate(&mut self, gain: f64, sd: f64, dof: f64);
-    fn estimator(&self) -> &EstimatorState;
     fn previous_command_um(&self) -> f64;
     fn neutral_um(&self) -> f64;
     fn neutral_variance_um2(&self) -> f64;
@@ -93,10 +92,6 @@ impl<L: ControlLaw> AnyLoop for Running<L> {
         self.control.start_estimate(&mut self.state, gain, sd, dof);
     }
 
-    fn estimator(&self) -> &EstimatorState {
-        &self.state.estimator
-    }
-
     fn previous_command_um(&self) -> f64 {
         self.state.previous_um
     }
@@ -128,7 +123,6 @@ pub struct Controller {
     running: Box<dyn AnyLoop>,
     settings: LoopParts<()>,
     preview_len: usize,
-    optimises: bool,
     columns: Vec<&'static str>,
 }
 
@@ -165,7 +159,6 @@ impl Controller {
         }
         check_columns(&columns)?;
         let preview_len = law.preview_len().max(BRAKING_TICKS);
-        let optimises = law.optimises();
         let settings = LoopParts {
             model: parts.model,
             estimator: parts.estimator,
@@ -183,7 +176,6 @@ impl Controller {
             }),
             settings,
             preview_len,
-            optimises,
             columns,
         })
     }
@@ -196,11 +188,6 @@ impl Controller {
     /// Puts the loop at rest at a command, with a first belief of neutral (both um). May allocate.
     pub fn start(&mut self, command_um: f64, neutral_um: f64) {
         self.running.start(command_um, neutral_um);
-    }
-
-    /// The estimator as it stands; its displacements are those of the PZT times the gain in force ([`crate::Tuning::gain`]).
-    pub fn estimator(&self) -> &EstimatorState {
-        self.running.estimator()
     }
 
     /// Displacement at which the bead rests, as far as it is known, um.
@@ -226,11 +213,6 @@ impl Controller {
     /// References of the coming ticks that a step can use.
     pub fn preview_len(&self) -> usize {
         self.preview_len
-    }
-
-    /// Whether its ticks have an account of an optimiser.
-    pub fn optimises(&self) -> bool {
-        self.optimises
     }
 
     /// Names of the law's own columns in the record.

@@ -3,7 +3,7 @@
 //! State: integrator position `q` and neutral `n` with their covariance; the fast modes are known functions of the
 //! commands. The filter stands at the time of the newest measurement it has used; the present is predicted from there
 //! through the commands since. A missing measurement just leaves the filter where it is (for up to
-//! [`Estimator::longest_lag`] ticks), so a late one is used at the time at which its frame was exposed, exactly.
+//! three ticks), so a late one is used at the time at which its frame was exposed, exactly.
 //!
 //! Brownian motion drives `q` with variance `2 D Ts` per tick, neutral is a random walk, and a relative uncertainty of
 //! the gain widens the covariance in proportion to the motion it predicts.
@@ -175,19 +175,9 @@ impl Estimator {
         })
     }
 
-    /// The configuration it was built from.
-    pub fn config(&self) -> &EstimatorConfig {
-        &self.config
-    }
-
     /// The plant it was built for.
     pub fn model(&self) -> &LoopModel {
         &self.model
-    }
-
-    /// Ticks by which a frame may be late and still be used at its own time.
-    pub fn longest_lag(&self) -> usize {
-        self.longest_lag
     }
 
     /// A state at rest: every past command was `command_um`, neutral is believed to be `neutral_um`, no bead seen.

@@ -167,11 +167,6 @@ pub trait ControlLaw: Debug + Send + 'static {
         0
     }
 
-    /// The law optimises: the record keeps the account of its solver.
-    fn optimises(&self) -> bool {
-        false
-    }
-
     /// Names of its columns in the record, at most [`LAW_COLUMNS`], with the unit in the name and the law's name before it.
     fn columns(&self) -> &'static [&'static str] {
         &[]

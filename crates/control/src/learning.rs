@@ -194,11 +194,6 @@ impl Learner {
         &self.refused
     }
 
-    /// Frequency of the reference, Hz.
-    pub fn frequency_hz(&self) -> f64 {
-        self.frequency_hz
-    }
-
     /// Nothing learned yet.
     pub fn start(&self) -> LearnerState {
         LearnerState {

@@ -280,16 +280,6 @@ impl Partner {
         })
     }
 
-    /// What it was built from.
-    pub fn config(&self) -> &PartnerConfig {
-        &self.config
-    }
-
-    /// Rate at which the partner takes a flow over from the PZT, um of PZT per second.
-    pub fn rate_um_per_s(&self) -> f64 {
-        self.most_um / (self.config.period_ms * 1e-3) * self.config.gain.abs()
-    }
-
     /// One tick.
     pub fn step(&self, state: &mut PartnerState, input: &PartnerInput) -> PartnerOutput {
         let steps = u32::try_from(input.steps).unwrap_or(u32::MAX);

@@ -177,72 +177,7 @@ fn move_um(
     }
 }
 
-impl Profile {
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`BuildError::OutOfRange`] naming the key.
-    pub fn validate(&self) -> Result<(), BuildError> {
-        match self {
-            Self::Hold { position_um } => check("position_um", "um", *position_um, true, "finite"),
-            Self::Ramp {
-                from_um,
-                to_um,
-                duration_s,
-            }
-            | Self::MinimumJerk {
-                from_um,
-                to_um,
-                duration_s,
-            } => {
-                check("from_um", "um", *from_um, true, "finite")?;
-                check("to_um", "um", *to_um, true, "finite")?;
-                check(
-                    "duration_s",
-                    "s",
-                    *duration_s,
-                    *duration_s >= 0.0,
-                    "0 or more",
-                )
-            }
-            Self::Wave {
-                centre_um,
-                amplitude_um,
-                frequency_hz,
-                fade_s,
-                ..
-            } => {
-                check("centre_um", "um", *centre_um, true, "finite")?;
-                check("amplitude_um", "um", *amplitude_um, true, "finite")?;
-                check(
-                    "frequency_hz",
-                    "Hz",
-                    *frequency_hz,
-                    *frequency_hz > 0.0,
-                    "positive",
-                )?;
-                check("fade_s", "s", *fade_s, *fade_s >= 0.0, "0 or more")
-            }
-            Self::Points(_) => Ok(()),
-            Self::Waveform {
-                samples_um,
-                period_s,
-            } => {
-                check(
-                    "samples_um",
-                    "samples",
-                    samples_um.len() as f64,
-                    samples_um.len() > 1,
-                    "at least two",
-                )?;
-                for sample in samples_um {
-                    check("samples_um", "um", *sample, true, "finite")?;
-                }
-                check("period_s", "s", *period_s, *period_s > 0.0, "positive")
-            }
-        }
-    }
-}
+impl Profile {}
 
 impl Reference for Profile {
     fn at_um(&self, time_s: f64) -> f64 {

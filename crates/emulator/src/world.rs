@@ -195,11 +195,6 @@ impl World {
         self.localisation_um
     }
 
-    /// Whether any part of the bead (or the cell) is within the frame.
-    pub fn bead_in_frame(&self) -> bool {
-        self.is_in_frame(self.bead_um(), self.length_um())
-    }
-
     fn is_in_frame(&self, x_um: f64, length_um: Option<f64>) -> bool {
         x_um.abs() < self.config.half_frame_um() + self.config.half_length_um(length_um)
     }

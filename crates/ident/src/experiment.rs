@@ -79,12 +79,7 @@ pub struct Turn {
     pub part: f64,
 }
 
-impl Turn {
-    /// A segment as it is planned.
-    pub fn planned(index: usize) -> Self {
-        Self { index, part: 1.0 }
-    }
-}
+impl Turn {}
 
 /// The expected plant and loop that amplitudes are shaped by, at one frequency: `X2/X1`, and plant times controller
 /// (0 in open loop).
@@ -269,14 +264,6 @@ impl Plan {
                 .extend((0..release).map(|k| fade_out(k, release) * value(total + k)));
         }
         schedule
-    }
-
-    /// Total duration, s.
-    pub fn duration_s(&self) -> f64 {
-        self.segments
-            .iter()
-            .map(|s| s.settle_s + s.measure_s + RELEASE_S)
-            .sum()
     }
 
     /// Ticks in all.

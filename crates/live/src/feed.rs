@@ -188,11 +188,6 @@ impl PictureFeed {
         // As many pictures exist as the ring has room for.
         let _ = self.filled.push(picture);
     }
-
-    /// Pictures that found none empty.
-    pub fn lost(&self) -> u64 {
-        self.lost
-    }
 }
 
 #[cfg(test)]
@@ -218,7 +213,7 @@ mod tests {
         }
         assert_eq!(feed.lost().rows, 10);
         assert_eq!(feed.lost().lines, 3);
-        assert_eq!(pictures.lost(), 2);
+        assert_eq!(pictures.lost, 2);
         assert_eq!(hub.rows.slots(), ROWS);
     }
 

@@ -204,11 +204,6 @@ impl Server {
         let word = self.shared.secrets.word(role);
         format!("http://{}/?word={word}", self.shared.address)
     }
-
-    /// Clients that look on.
-    pub fn clients(&self) -> usize {
-        self.shared.clients.count()
-    }
 }
 
 impl Drop for Server {

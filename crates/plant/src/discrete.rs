@@ -7,7 +7,6 @@
 use crate::error::PlantError;
 use crate::modal::{Zpk, residues, separate};
 use crate::phi::phi;
-use crate::roots;
 use crate::transfer::TransferFunction;
 use cellpos_numeric::units::{Hertz, Seconds};
 use nalgebra::{Complex, DMatrix, DVector, RowDVector};
@@ -105,16 +104,6 @@ impl DiscretePlant {
             modes,
             feedthrough,
         })
-    }
-
-    /// Sample time.
-    pub fn sample(&self) -> Seconds {
-        Seconds(self.sample_s)
-    }
-
-    /// Delay.
-    pub fn delay(&self) -> Seconds {
-        Seconds(self.delay_s)
     }
 
     /// Number of states of the strictly proper form: modes and `1 + floor(delay / sample)` past commands.
@@ -243,85 +232,5 @@ impl DiscretePlant {
         }
         c[oldest] += self.feedthrough;
         (a, b, c)
-    }
-
-    /// The poles in z that belong to the plant (those of the delay are at zero).
-    pub fn poles(&self) -> Vec<Complex<f64>> {
-        self.modes
-            .iter()
-            .flat_map(|m| {
-                let second = (!m.real).then(|| m.pole.conj());
-                std::iter::once(m.pole).chain(second)
-            })
-            .collect()
-    }
-
-    /// The zeros in z of the strictly proper form `y_k = C x_k + D u_(k-1)`, by magnitude.
-    pub fn zeros(&self) -> Vec<Complex<f64>> {
-        self.numerator_zeros(false)
-    }
-
-    /// The zeros in z of the biproper form `y_k = C x_k + D u_k`, which differs from a camera's record. It shows why that form
-    /// must not be inverted (Eq. (6) at 1 ms: z = -19.3).
-    pub fn biproper_zeros(&self) -> Vec<Complex<f64>> {
-        self.numerator_zeros(true)
-    }
-
-    fn numerator_zeros(&self, biproper: bool) -> Vec<Complex<f64>> {
-        // N(z) = D [z] prod(z - p) + sum (w (early + late z)) prod others, over z prod(z - p).
-        let poles = self.poles();
-        let product = |skip: Option<usize>| {
-            let mut p = vec![Complex::new(1.0, 0.0)];
-            for (i, pole) in poles.iter().enumerate() {
-                if Some(i) == skip {
-                    continue;
-                }
-                let mut next = vec![Complex::new(0.0, 0.0); p.len() + 1];
-                for (k, c) in p.iter().enumerate() {
-                    next[k] += c;
-                    next[k + 1] -= c * pole;
-                }
-                p = next;
-            }
-            p
-        };
-        let n = poles.len();
-        // Ascending index = descending power; degree n + 1.
-        let mut numerator = vec![Complex::new(0.0, 0.0); n + 2];
-        let offset = if biproper { 0 } else { 1 };
-        for (k, c) in product(None).iter().enumerate() {
-            numerator[k + offset] += c * self.feedthrough;
-        }
-        let mut index = 0;
-        for m in &self.modes {
-            let half = if m.real { 1.0 } else { 0.5 };
-            let mut add = |index: usize, w: Complex<f64>, early, late| {
-                for (k, c) in product(Some(index)).iter().enumerate() {
-                    numerator[k + 1] += c * w * late;
-                    numerator[k + 2] += c * w * early;
-                }
-            };
-            add(index, m.weight * half, m.early, m.late);
-            index += 1;
-            if !m.real {
-                add(index, m.weight.conj() * half, m.early.conj(), m.late.conj());
-                index += 1;
-            }
-        }
-        let real: Vec<f64> = numerator.iter().map(|c| c.re).collect();
-        let largest = real.iter().fold(0.0_f64, |m, c| m.max(c.abs()));
-        // Coefficients that are rounding only would be zeros at infinity or at the origin.
-        let cleaned: Vec<f64> = real
-            .iter()
-            .map(|&c| if c.abs() < 1e-14 * largest { 0.0 } else { c })
-            .collect();
-        let mut zeros = roots::roots(&cleaned);
-        if !biproper || self.feedthrough == 0.0 {
-            // For a delay of whole samples, the factor z cancels against the pole at the origin.
-            if let Some(i) = zeros.iter().position(|z| z.norm() == 0.0) {
-                zeros.remove(i);
-            }
-        }
-        zeros
     }
 }

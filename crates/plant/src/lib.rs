@@ -5,7 +5,7 @@
 //! - [`DiscretePlant`]: exact zero-order hold with any delay, for controllers and estimators.
 //! - [`Model`]: plant, [`Effect`]s and [`Noise`]; all commands share it. On disk it is `model.toml`.
 //! - [`Chain`]: a model as a time-stepping machine from the command to the true bead position; [`Simulator`] adds the
-//!   camera at a fixed sample time; [`simulate`] and [`simulate_at`] answer whole records.
+//!   camera at a fixed sample time; [`simulate`] answers whole records.
 //!
 //! Sampling convention everywhere: row k holds the displacement commanded from its time on, and the bead's position
 //! just before that command takes effect.
@@ -29,7 +29,6 @@ mod chain;
 mod discrete;
 pub mod effects;
 mod error;
-mod frames;
 mod modal;
 mod model;
 mod model_file;
@@ -46,11 +45,10 @@ pub use chain::{Chain, ChainError, TiedPlant};
 pub use discrete::{DiscretePlant, DiscreteState};
 pub use effects::{Effect, EffectError, Parameter, Place};
 pub use error::{ModelError, ModelProblem, PlantError, Position};
-pub use frames::{FrameFate, apply_frame_fates, frame_fates};
 pub use modal::Zpk;
 pub use model::{Covariance, Model, Noise};
 pub use nalgebra::Complex;
-pub use simulate::{Sampled, SimulateError, SimulateOptions, Simulator, simulate, simulate_at};
+pub use simulate::{Sampled, SimulateError, SimulateOptions, Simulator, simulate};
 pub use state_space::StateSpace;
 pub use transfer::{
     EQ5_LITERAL_PER_S, EQ5_VELOCITY_GAIN_PER_S, MAX_ORDER, ProbablyPerHertz, TransferFunction,

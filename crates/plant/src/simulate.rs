@@ -44,24 +44,6 @@ pub enum SimulateError {
         /// The value.
         value: f64,
     },
-    /// Times that do not rise.
-    #[error("row {row}: time_s = {time_s} does not come after {before_s}: times must rise")]
-    TimeOrder {
-        /// Row, from 0.
-        row: usize,
-        /// Its time, s.
-        time_s: f64,
-        /// The time before it, s.
-        before_s: f64,
-    },
-    /// Lists of different lengths.
-    #[error("{times} times but {commands} displacements: there must be one of each per row")]
-    Lengths {
-        /// Number of times.
-        times: usize,
-        /// Number of displacements.
-        commands: usize,
-    },
 }
 
 /// An instant that lies `whole` samples and `part_s` before a row's time.
@@ -276,23 +258,6 @@ impl Simulator {
         y
     }
 
-    /// Restarts at rest at the working point, at row 0. The random numbers are not restarted.
-    pub fn reset(&mut self) {
-        self.chain.reset();
-        self.note_rest();
-        self.row = 0;
-    }
-
-    /// The number of rows so far.
-    pub fn row(&self) -> usize {
-        self.row
-    }
-
-    /// The rig from the command to the bead, for its true positions.
-    pub fn chain(&self) -> &Chain {
-        &self.chain
-    }
-
     /// The response to a record that starts at row 0, written to `bead_um`; the shorter of the two lengths counts.
     pub fn run(&mut self, pzt_um: &[f64], sampled: Sampled, bead_um: &mut [f64]) {
         for (u, y) in pzt_um.iter().zip(bead_um) {
@@ -311,7 +276,7 @@ impl Simulator {
 /// The bead positions \[um\] that a model records in answer to displacements \[um\] held for `sample_s` each.
 ///
 /// Row k of the answer belongs to row k of `pzt_um`. Before row 0 the rig is at rest at the working point, with the bead at 0 um
-/// or where equations that replace the plant begin. Frames are neither dropped nor repeated here: see [`crate::frame_fates`].
+/// or where equations that replace the plant begin. Frames are neither dropped nor repeated here: the emulated camera does that.
 ///
 /// # Errors
 /// A model with numbers out of range, a sample time outside 0.1 us..1e5 s, displacements that are not finite.
@@ -329,55 +294,18 @@ pub fn simulate(
     if simulator.camera.skew == 0.0 {
         simulator.run(pzt_um, options.sampled, &mut bead_um);
     } else {
-        let times: Vec<f64> = (0..pzt_um.len()).map(|k| k as f64 * sample_s).collect();
-        irregular(simulator, &times, pzt_um, options.sampled, &mut bead_um);
+        skewed(simulator, sample_s, pzt_um, options.sampled, &mut bead_um);
     }
-    Ok(bead_um)
-}
-
-/// As [`simulate`], for rows at any rising times \[s\], for example a record with missing rows. Each displacement is held until
-/// the next existing row. The first row's time is the start.
-///
-/// # Errors
-/// As [`simulate`], and times that do not rise.
-pub fn simulate_at(
-    model: &Model,
-    time_s: &[f64],
-    pzt_um: &[f64],
-    options: &SimulateOptions,
-) -> Result<Vec<f64>, SimulateError> {
-    if time_s.len() != pzt_um.len() {
-        return Err(SimulateError::Lengths {
-            times: time_s.len(),
-            commands: pzt_um.len(),
-        });
-    }
-    for (row, pair) in time_s.windows(2).enumerate() {
-        // Written so that a time that is not a number is refused as well.
-        if !(pair[1] > pair[0] && pair[1].is_finite()) {
-            return Err(SimulateError::TimeOrder {
-                row: row + 1,
-                time_s: pair[1],
-                before_s: pair[0],
-            });
-        }
-    }
-    if let Some((row, value)) = pzt_um.iter().enumerate().find(|(_, u)| !u.is_finite()) {
-        return Err(SimulateError::NotFinite { row, value: *value });
-    }
-    let simulator = Simulator::new(model, 1e-3, options.seed)?;
-    let mut bead_um = vec![0.0; pzt_um.len()];
-    irregular(simulator, time_s, pzt_um, options.sampled, &mut bead_um);
     Ok(bead_um)
 }
 
 /// Instants nearer than this to a command, s, coincide with it.
 const COINCIDENT_S: f64 = 1e-9;
 
-/// Rows at any times, with clock skew: the chain stops at every instant that a frame sees.
-fn irregular(
+/// Rows of a camera whose clock is not the drive's: the chain stops at every instant that a frame sees.
+fn skewed(
     simulator: Simulator,
-    time_s: &[f64],
+    sample_s: f64,
     pzt_um: &[f64],
     sampled: Sampled,
     bead_um: &mut [f64],
@@ -387,11 +315,11 @@ fn irregular(
         mut camera,
         ..
     } = simulator;
-    let origin = time_s.first().copied().unwrap_or(0.0);
     let n = pzt_um.len();
+    let time_s = |k: usize| k as f64 * sample_s;
     let exposure = camera.exposure_s;
     // Row k's exposure ends at end(k) and begins `exposure` before, in time since the first row.
-    let end = |k: usize| (1.0 + camera.skew) * (time_s[k] - origin) - camera.delay_s;
+    let end = |k: usize| (1.0 + camera.skew) * time_s(k) - camera.delay_s;
     let rest_um = chain.bead_um();
     let mut ends = vec![Note::default(); n];
     let mut begins = vec![Note::default(); n];
@@ -399,7 +327,7 @@ fn irregular(
     let mut now = 0.0;
     for (j, &command) in pzt_um.iter().enumerate() {
         let until = if j + 1 < n {
-            time_s[j + 1] - origin
+            time_s(j + 1)
         } else {
             f64::INFINITY
         };
@@ -457,7 +385,6 @@ fn irregular(
         } else {
             ends[k].bead_um
         };
-        let time = time_s[k] - origin;
-        bead_um[k] = camera.record(seen, time);
+        bead_um[k] = camera.record(seen, time_s(k));
     }
 }

@@ -164,15 +164,6 @@ impl TransferFunction {
         roots::roots(&self.num)
     }
 
-    /// The value for s towards infinity: the bead's jump per um of displacement. Zero for a strictly proper function.
-    pub fn feedthrough(&self) -> f64 {
-        if self.num.len() == self.den.len() {
-            self.num[0] / self.den[0]
-        } else {
-            0.0
-        }
-    }
-
     /// `w |G(jw)|` at a frequency: the velocity gain K \[1/s\] of the integrator that has the same gain there.
     pub fn velocity_gain_at(&self, frequency: Hertz) -> f64 {
         TAU * frequency.value() * self.response(frequency).norm()

@@ -359,11 +359,6 @@ impl RunWriter {
         &self.folder
     }
 
-    /// The run's metadata as written.
-    pub fn meta(&self) -> &RunMeta {
-        &self.meta
-    }
-
     /// Adds conditions that are known only during the run; they are written at the end.
     pub fn add_conditions(&mut self, conditions: toml::Table) {
         self.meta.conditions.extend(conditions);
@@ -387,11 +382,6 @@ impl RunWriter {
     /// Writes all waiting rows, whatever their age.
     pub fn flush(&mut self) {
         self.log.flush();
-    }
-
-    /// The data that could not be written so far.
-    pub fn faults(&self) -> Faults {
-        self.log.faults()
     }
 
     /// Rows that the disk has not confirmed, including those that still gather for the next flush. The time counts from

@@ -99,8 +99,6 @@ pub struct HeatMap {
     pub(crate) columns: Vec<String>,
     pub(crate) values: Vec<f64>,
     pub(crate) label: String,
-    pub(crate) range: Option<(f64, f64)>,
-    pub(crate) decimals: usize,
 }
 
 impl HeatMap {
@@ -121,23 +119,7 @@ impl HeatMap {
                 .collect(),
             values: values.to_vec(),
             label: label.to_owned(),
-            range: None,
-            decimals: 1,
         }
-    }
-
-    /// Fixes the values at which the colours end; without it they follow the data.
-    #[must_use]
-    pub fn range(mut self, low: f64, high: f64) -> Self {
-        self.range = (low.is_finite() && high.is_finite() && low < high).then_some((low, high));
-        self
-    }
-
-    /// Decimals of the numbers written in the cells (default 1).
-    #[must_use]
-    pub fn decimals(mut self, decimals: usize) -> Self {
-        self.decimals = decimals.min(9);
-        self
     }
 
     /// Value of a cell, if there is one.

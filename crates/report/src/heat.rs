@@ -42,7 +42,7 @@ pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
                 at: (x + 0.5, y + 0.5),
                 size: (cell_w - 1.0, cell_h - 1.0),
             });
-            let text = format!("{value:.*}", map.decimals).replace('-', "\u{2212}");
+            let text = number(value);
             if svg::text_width_px(&text) < cell_w {
                 let class = if dark { "cellw" } else { "cell" };
                 let at = (x + cell_w / 2.0, y + cell_h / 2.0 + 4.0);
@@ -63,7 +63,6 @@ pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
             size: (bar_w / 60.0 + 0.3, 10.0),
         });
     }
-    let number = |value: f64| format!("{value:.*}", map.decimals).replace('-', "\u{2212}");
     drawing.text("mut", (left, bar_y + 24.0), Anchor::Start, &number(low));
     drawing.text(
         "mut",
@@ -77,11 +76,12 @@ pub(crate) fn heat_map(drawing: &mut Drawing, map: &HeatMap) -> f64 {
     bar_y + high.max(30.0) + 4.0
 }
 
+fn number(value: f64) -> String {
+    format!("{value:.1}").replace('-', "\u{2212}")
+}
+
 /// Ends of the colours: symmetric about zero when the values have both signs.
 fn heat_range(map: &HeatMap) -> (f64, f64) {
-    if let Some(range) = map.range {
-        return range;
-    }
     let finite = map.values.iter().copied().filter(|value| value.is_finite());
     let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
         (low.min(v), high.max(v))

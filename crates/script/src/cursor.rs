@@ -315,18 +315,8 @@ impl Cursor {
         }
     }
 
-    /// What is going on.
-    pub fn status(&self) -> Progress {
-        self.status
-    }
-
     /// Time of the plan, s.
     pub fn plan_s(&self) -> f64 {
         self.plan_s
-    }
-
-    /// Running time, waits and pauses included, of all sessions, s.
-    pub fn elapsed_s(&self) -> f64 {
-        self.elapsed_s
     }
 }

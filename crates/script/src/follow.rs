@@ -84,16 +84,6 @@ impl Follower {
         self
     }
 
-    /// The plan.
-    pub fn plan(&self) -> &Plan {
-        &self.plan
-    }
-
-    /// Its activity.
-    pub fn stage(&self) -> Stage {
-        self.stage
-    }
-
     fn seen(&self, input: &ReferenceInput) -> Seen {
         let back = (self.delay_ticks + usize::from(input.age_ticks)).clamp(1, PAST);
         let then_um = self
@@ -395,12 +385,12 @@ mod tests {
             let output = late.step(&input(past[1]), &mut preview);
             past = [output.reference_um, past[0], past[1]];
         }
-        assert_eq!(late.stage(), Stage::Done);
+        assert_eq!(late.stage, Stage::Done);
         let mut lost = follower(text);
         while !lost.finished() {
             lost.step(&input(0.0), &mut preview);
         }
-        assert_eq!(lost.stage(), Stage::StoppedError);
+        assert_eq!(lost.stage, Stage::StoppedError);
     }
 
     #[test]

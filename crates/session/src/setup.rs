@@ -282,15 +282,29 @@ impl Setup {
     /// # Errors
     /// An invalid value; the error names it.
     pub fn core_with(&self, law: Controller) -> Result<Core<AnyReference>, Failure> {
-        self.joined(law, self.config.reference.generator(&self.config.timing)?)
-    }
-
-    /// Builds the loop with another reference generator.
-    ///
-    /// # Errors
-    /// An invalid value; the error names it.
-    pub fn core_following<R: ReferenceGenerator>(&self, reference: R) -> Result<Core<R>, Failure> {
-        self.joined(self.law()?, reference)
+        let sample_s = self.config.timing.period_us * 1e-6;
+        let plant =
+            DesignPlant::from_model(&self.model, Some(self.controller.delay_ms * 1e-3), sample_s)
+                .map_err(Failure::input)?;
+        let partner = self
+            .config
+            .partner
+            .map(|config| Partner::new(config, &law.settings().limits, sample_s));
+        let partner = partner.transpose().map_err(Failure::input)?;
+        let core = Core::with_controller(
+            law,
+            self.config.reference.generator(&self.config.timing)?,
+            self.config.timing,
+            self.config.arming,
+            &plant.plant,
+            [self.config.displacement_um, self.config.neutral_um],
+        )
+        .map_err(Failure::input)?
+        .with_watchdog_ms(self.config.watchdog_ms);
+        Ok(match partner {
+            Some(partner) => core.with_partner(partner),
+            None => core,
+        })
     }
 
     /// The spectrum that the loop's linear model predicts for the measured error of a hold, at each frequency, Hz. `None`: nothing
@@ -315,36 +329,6 @@ impl Setup {
                 .map(|um| um * 1e3)
                 .collect(),
             per_noise: of(0.0, 1.0)?,
-        })
-    }
-
-    fn joined<R: ReferenceGenerator>(
-        &self,
-        law: Controller,
-        reference: R,
-    ) -> Result<Core<R>, Failure> {
-        let sample_s = self.config.timing.period_us * 1e-6;
-        let plant =
-            DesignPlant::from_model(&self.model, Some(self.controller.delay_ms * 1e-3), sample_s)
-                .map_err(Failure::input)?;
-        let partner = self
-            .config
-            .partner
-            .map(|config| Partner::new(config, &law.settings().limits, sample_s));
-        let partner = partner.transpose().map_err(Failure::input)?;
-        let core = Core::with_controller(
-            law,
-            reference,
-            self.config.timing,
-            self.config.arming,
-            &plant.plant,
-            [self.config.displacement_um, self.config.neutral_um],
-        )
-        .map_err(Failure::input)?
-        .with_watchdog_ms(self.config.watchdog_ms);
-        Ok(match partner {
-            Some(partner) => core.with_partner(partner),
-            None => core,
         })
     }
 }

@@ -89,8 +89,6 @@ impl Block for OneSided {
         }
     }
 
-    fn reset(&mut self) {}
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

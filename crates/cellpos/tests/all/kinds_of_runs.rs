@@ -1,6 +1,7 @@
 //! Every kind of run through every command that reads one; what is missing or damaged around a run.
 
 use crate::common::{cellpos, succeed};
+use cellpos_numeric::parallel::map;
 use cellpos_record::export::columns::OF_LAWS;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -180,7 +181,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
         ("killed", cut),
         ("without a summary", bare),
     ];
-    for (kind, run) in &runs {
+    map(&runs, 2, |(kind, run)| {
         let path = run.display();
         let exported: Value = succeed(at, &format!("export {path} --json")).json();
         let rows = exported["rows"].as_u64().unwrap();
@@ -214,7 +215,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
             &format!("simulate --model eq6 --input {path} --out {simulated}"),
         );
         compared(at, kind, run);
-    }
+    });
     let (_, resumed) = &runs[4];
     let of_sessions = succeed(at, &format!("export {} --force --json", resumed.display())).json();
     assert_eq!(of_sessions["sessions"], 2);

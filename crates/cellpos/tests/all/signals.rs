@@ -1,5 +1,6 @@
 //! Signals to a program that holds a rig: freeze, keep what is finished, park; and none that ends it half-way.
 
+use cellpos_numeric::parallel::map;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Read};
@@ -217,11 +218,11 @@ fn a_script_of_sixteen_thousand_steps_starts_on_the_clock_of_the_machine() {
 }
 
 const IDENTIFY: &str = "identify --rig rig.toml --clock real --frames off --best-effort \
-     --frequency 10Hz,20Hz,40Hz,80Hz --led-edges 0 --bootstrap 0 --json";
+     --frequency 20Hz,40Hz,80Hz,160Hz --led-edges 0 --bootstrap 0 --json";
 
 #[test]
 fn an_identification_keeps_its_segments_as_they_end_whatever_ends_it() {
-    for signal in [Signal::INT, Signal::KILL] {
+    map(&[Signal::INT, Signal::KILL], 2, |&signal| {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("rig.toml"), "[emulator]\nseed = 3\n").unwrap();
         let mut child = start(folder.path(), IDENTIFY);
@@ -238,7 +239,7 @@ fn an_identification_keeps_its_segments_as_they_end_whatever_ends_it() {
             assert_eq!(out.status.code(), Some(1), "{text}");
             assert!(text.contains("--resume"), "{text}");
         }
-    }
+    });
 }
 
 /// A command that holds a rig, the files that it needs, and a sign from outside that it holds the rig.
@@ -328,13 +329,13 @@ fn state(process: Pid) -> Option<char> {
 
 #[test]
 fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop() {
-    for Holding {
-        line,
-        sign,
-        text,
-        lets_go,
-    } in HOLDING
-    {
+    map(&HOLDING, 3, |holding| {
+        let &Holding {
+            line,
+            sign,
+            text,
+            lets_go,
+        } = holding;
         let folder = prepared();
         let mut child = start_with(folder.path(), line, "--ignore-signal=HUP");
         if sign.is_empty() {
@@ -378,12 +379,12 @@ fn no_command_that_holds_a_rig_is_ended_or_stopped_by_a_signal_that_is_no_stop()
             out.status,
             String::from_utf8_lossy(&out.stderr)
         );
-    }
+    });
 }
 
 #[test]
 fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
-    for Holding { line, .. } in HOLDING {
+    map(&HOLDING, 3, |Holding { line, .. }| {
         for delay_ms in [5, 40] {
             let folder = prepared();
             let child = start(folder.path(), line);
@@ -407,7 +408,7 @@ fn a_stop_in_the_first_moments_of_any_command_that_holds_a_rig_is_an_end() {
                 );
             }
         }
-    }
+    });
 }
 
 /// A measurement of a night that is ended in the morning prints its result.

@@ -1,6 +1,7 @@
 //! `cellpos track` as a user runs it, on the virtual clock: how well it holds, what it prints, what it records.
 
 use crate::common::{cellpos, number, succeed};
+use cellpos_numeric::parallel::map;
 use cellpos_plant::Model;
 use std::path::Path;
 
@@ -227,12 +228,12 @@ fn each_fault_ends_as_it_should_and_is_named() {
             &["\"safe-latched\""],
         ),
     ];
-    for Case {
-        fault,
-        safe_reason,
-        events,
-    } in cases
-    {
+    let ends_as_it_should = |case: &Case| {
+        let &Case {
+            fault,
+            safe_reason,
+            events,
+        } = case;
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(
             folder.path().join("rig.toml"),
@@ -258,7 +259,8 @@ fn each_fault_ends_as_it_should_and_is_named() {
         // Only a bead that is held sticks: one that is not told where to go does not.
         let sticks = fault.contains("stick-bead");
         assert_eq!(log.contains("\"stuck-started\""), sticks, "{fault}\n{log}");
-    }
+    };
+    map(&cases, 2, ends_as_it_should);
 }
 
 #[test]

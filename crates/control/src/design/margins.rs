@@ -2,6 +2,7 @@
 
 use crate::design::plant::DesignPlant;
 use crate::linear::LinearLaw;
+use cellpos_numeric::golden_section;
 use cellpos_plant::{DiscretePlant, PlantError};
 use nalgebra::{Complex, DMatrix, Schur};
 use std::f64::consts::{PI, TAU};
@@ -213,20 +214,12 @@ fn peak(
     let best = (0..values.len())
         .max_by(|&i, &j| values[i].total_cmp(&values[j]))
         .unwrap_or(0);
-    let (mut low, mut high) = (
+    let hz = golden_section(
         curve[best.saturating_sub(1)].0,
         curve[(best + 1).min(curve.len() - 1)].0,
+        0.0,
+        |hz| -exact(hz),
     );
-    let ratio = 0.5 * (5.0_f64.sqrt() - 1.0);
-    for _ in 0..40 {
-        let (a, b) = (high - ratio * (high - low), low + ratio * (high - low));
-        if exact(a) > exact(b) {
-            high = b
-        } else {
-            low = a
-        }
-    }
-    let hz = 0.5 * (low + high);
     let refined = exact(hz);
     if refined > values[best] {
         (hz, refined)

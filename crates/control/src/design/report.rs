@@ -109,14 +109,6 @@ impl DesignLimits {
     pub fn load(path: &std::path::Path) -> Result<Self, ConfigError> {
         toml_file::load(path)
     }
-
-    /// Reads the text of a limits file; `file` is for the messages only.
-    ///
-    /// # Errors
-    /// Text that is not TOML, unknown keys, wrong types, a number that is not positive.
-    pub fn from_toml_str(text: &str, file: &str) -> Result<Self, ConfigError> {
-        toml_file::parse(text, file)
-    }
 }
 
 impl TomlFile for DesignLimits {

@@ -8,7 +8,11 @@ use crate::design::margins::{Grid, is_stable};
 use crate::design::plant::DesignPlant;
 use crate::linear::LinearLaw;
 use crate::pi::{Lead, Pi};
+use cellpos_numeric::golden_section;
 use cellpos_plant::{Hertz, PlantError};
+
+/// How exactly the best proportional gain is found, as a part of two steps of the scan.
+const KP_TOLERANCE: f64 = 7e-5;
 
 /// What to search under.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -136,17 +140,8 @@ pub fn search_pi(plant: &DesignPlant, search: PiSearch) -> Result<Option<Pi>, Pl
         return Ok(None);
     };
     let step = highest / 60.0;
-    let (mut low, mut high) = (scan[best].0 - step, scan[best].0 + step);
-    let ratio = 0.5 * (5.0_f64.sqrt() - 1.0);
-    for _ in 0..20 {
-        let (a, b) = (high - ratio * (high - low), low + ratio * (high - low));
-        if problem.best_ki(a) > problem.best_ki(b) {
-            high = b
-        } else {
-            low = a
-        }
-    }
-    let refined = 0.5 * (low + high);
+    let (low, high) = (scan[best].0 - step, scan[best].0 + step);
+    let refined = golden_section(low, high, KP_TOLERANCE, |kp| -problem.best_ki(kp));
     let (kp, ki) = std::iter::once((refined, problem.best_ki(refined)))
         .chain(std::iter::once(scan[best]))
         .max_by(|a, b| a.1.total_cmp(&b.1))

@@ -348,10 +348,6 @@ impl ControlLaw for MpcLaw {
         HORIZON
     }
 
-    fn optimises(&self) -> bool {
-        true
-    }
-
     fn columns(&self) -> &'static [&'static str] {
         &["mpc_feed_forward_um", "mpc_fallback_integral_um"]
     }

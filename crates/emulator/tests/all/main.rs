@@ -3,9 +3,9 @@
 mod background;
 mod cell;
 mod imperfections;
-mod line;
 mod rig_in_a_box;
 mod scene;
+mod scene_camera;
 mod suggested;
 mod world;
 mod world_faults;

@@ -1,6 +1,6 @@
 //! Tracking in rendered scenes that are hard to see in.
 
-use cellpos_emulator::scene::{SceneCamera, SceneConfig};
+use crate::scene_camera::{SceneCamera, SceneConfig};
 use cellpos_rig::{Camera, Clock, FrameBuffer};
 use cellpos_vision::{
     Learning, Localiser, LocaliserConfig, ProfileSpec, TrackState, Tracker, TrackerConfig,

@@ -1,6 +1,6 @@
 //! Settings found in pictures of the emulated rig, whose walls and dust stay where they are while a bead goes along them.
 
-use crate::world::{MS, world};
+use crate::world::{MS, bead_in_frame, world};
 use cellpos_emulator::{BeadLook, World, WorldConfig};
 use cellpos_vision::suggest::suggest;
 use cellpos_vision::{Frame, Pixels};
@@ -36,7 +36,7 @@ fn a_wall_along_which_a_bead_goes_is_no_part_of_the_bead() {
         let mut world = world(&config);
         for from_s in [0, 3] {
             let kept = three_seconds(&mut world);
-            assert!(world.bead_in_frame());
+            assert!(bead_in_frame(&world, &config));
             let frames: Vec<Frame> = kept
                 .iter()
                 .map(|pixels| Frame {

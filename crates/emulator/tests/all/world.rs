@@ -18,6 +18,11 @@ pub(crate) fn world(config: &WorldConfig) -> World {
     World::new(config, &Model::eq6(), 0).unwrap()
 }
 
+/// Whether any part of the bead is within the frame.
+pub(crate) fn bead_in_frame(world: &World, config: &WorldConfig) -> bool {
+    world.bead_um().abs() < config.half_frame_um() + config.bead_radius_um
+}
+
 /// Runs for `ms` milliseconds at a constant output; the positions delivered.
 pub(crate) fn positions(world: &mut World, ms: i64, applied_um: f64) -> Vec<PositionFix> {
     let mut all = Vec::new();

@@ -1,6 +1,6 @@
 //! Faults of the emulated world: frames, beads and the camera.
 
-use crate::world::{MS, ids, localiser, locate, positions, quiet, world};
+use crate::world::{MS, bead_in_frame, ids, localiser, locate, positions, quiet, world};
 use cellpos_emulator::{FaultKind, Faults, World, WorldConfig};
 use cellpos_plant::{Chain, Model};
 use cellpos_vision::FixQuality;
@@ -162,9 +162,12 @@ fn a_bead_that_was_carried_off_is_replaced_once_the_flow_is_slow() {
     };
     let mut world = world(&config);
     positions(&mut world, 20, 0.0);
-    assert!(!world.bead_in_frame(), "20 um from neutral: 8.5 mm/s");
+    assert!(
+        !bead_in_frame(&world, &config),
+        "20 um from neutral: 8.5 mm/s"
+    );
     positions(&mut world, 300, 20.0);
-    assert!(world.bead_in_frame());
+    assert!(bead_in_frame(&world, &config));
     // At 51 um/s or less, dying away with the pole at 76 rad/s, and the slow pole's 3 um/s for 0.3 s.
     assert!(world.bead_um().abs() < 2.0, "{}", world.bead_um());
 }
@@ -179,15 +182,15 @@ fn a_flow_that_is_not_slow_brings_the_next_bead_from_upstream_and_carries_it_thr
         let mut world = world(&config);
         // 0.43 mm/s: through the field of 25.6 um in 60 ms.
         positions(&mut world, 130, 20.0 + away_um);
-        assert!(!world.bead_in_frame());
+        assert!(!bead_in_frame(&world, &config));
         let (mut passed, mut seen_um) = (0, Vec::new());
         for _ in 0..1000 {
-            let was_in = world.bead_in_frame();
+            let was_in = bead_in_frame(&world, &config);
             positions(&mut world, 1, 20.0 + away_um);
-            if world.bead_in_frame() {
+            if bead_in_frame(&world, &config) {
                 seen_um.push(away_um.signum() * world.bead_um());
             }
-            passed += i32::from(was_in && !world.bead_in_frame());
+            passed += i32::from(was_in && !bead_in_frame(&world, &config));
         }
         let ends_um = seen_um
             .iter()

@@ -88,12 +88,6 @@ quantity!(
     "us, ms, s, min, h"
 );
 quantity!(
-    /// A voltage in volts (V): the control input of the PZT amplifier.
-    Volts, "a voltage", "V",
-    ["mV" = 1e-3, "V" = 1.0],
-    "mV, V"
-);
-quantity!(
     /// A frequency in hertz (Hz), never rad/s.
     Hertz, "a frequency", "Hz",
     ["mHz" = 1e-3, "Hz" = 1.0, "kHz" = 1e3],

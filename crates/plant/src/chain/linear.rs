@@ -130,14 +130,6 @@ impl LinearGroup {
         }
     }
 
-    /// Back to rest.
-    pub(crate) fn reset(&mut self) {
-        self.x.fill(0.0);
-        self.z.fill(Complex::new(0.0, 0.0));
-        self.last_input = 0.0;
-        self.last_slope = 0.0;
-    }
-
     /// The fastest pole's magnitude \[rad/s\] among those with a share in the output.
     pub(crate) fn fastest(&self) -> f64 {
         let real = self.real.iter().map(|m| m.pole.abs());

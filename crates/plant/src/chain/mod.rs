@@ -98,7 +98,6 @@ pub struct Chain {
 struct Brownian {
     diffusion_um2_per_s: f64,
     gaussian: Random,
-    on: bool,
 }
 
 impl Chain {
@@ -148,44 +147,13 @@ impl Chain {
         chain.brownian = Some(Brownian {
             diffusion_um2_per_s: model.noise.diffusion_um2_per_s,
             gaussian: Random::new(seed),
-            on: true,
         });
         Ok(chain)
-    }
-
-    /// Switches Brownian motion off and on again (a chain made without it has none to switch on).
-    pub fn set_brownian_motion(&mut self, on: bool) {
-        if let Some(b) = &mut self.brownian {
-            b.on = on;
-        }
     }
 
     /// Keeps the integral of the bead position from now on, for exposures.
     pub(crate) fn keep_area(&mut self) {
         self.wants_area = true;
-    }
-
-    /// Returns to rest at the working point at time 0, with the bead at 0 um, or where equations that replace the plant begin. The random
-    /// numbers are not restarted.
-    pub fn reset(&mut self) {
-        for stage in &mut self.compiled.stages {
-            match stage {
-                Stage::Linear(group) => group.reset(),
-                Stage::Block(block) => block.reset(),
-                Stage::Tied(tied) => tied.reset(),
-            }
-        }
-        for group in &mut self.compiled.bypass {
-            group.reset();
-        }
-        self.time_s = 0.0;
-        self.command_um = 0.0;
-        self.driver_um = 0.0;
-        self.beside_um = 0.0;
-        self.output = Piece::default();
-        self.offset_um = 0.0;
-        self.area_um_s = 0.0;
-        self.rest();
     }
 
     /// Applies the initial level of equations that replace the plant: if it is not 0, it exists before the first command.
@@ -299,7 +267,6 @@ impl Chain {
             self.area_um_s += signal.integral + h_s * self.offset_um;
         }
         if let Some(b) = &mut self.brownian
-            && b.on
             && h_s > 0.0
         {
             let variance = 2.0 * b.diffusion_um2_per_s * h_s;
@@ -338,11 +305,6 @@ impl Chain {
         self.working_point_um + reached
     }
 
-    /// The displacement that the driver demands from the PZT after saturation and slew limit, um, absolute.
-    pub fn driver_um(&self) -> f64 {
-        self.working_point_um + self.driver_um
-    }
-
     /// The speed of the flow that carries the bead, um/s, before adhesion holds the bead back.
     pub fn flow_um_per_s(&self) -> f64 {
         let mut speed = 0.0;
@@ -354,10 +316,5 @@ impl Chain {
             }
         }
         speed
-    }
-
-    /// Sets the bead's position, um: another bead is chosen, or the origin is moved.
-    pub fn place_bead(&mut self, bead_um: f64) {
-        self.offset_um += bead_um - self.bead_um();
     }
 }

@@ -47,15 +47,6 @@ impl TiedPlant {
         self.longest_s
     }
 
-    /// Back to rest.
-    pub fn reset(&mut self) {
-        self.plant.reset();
-        self.ties.iter_mut().for_each(|t| t.reset());
-        self.drive = 0.0;
-        self.position = 0.0;
-        self.velocity = 0.0;
-    }
-
     /// Whether something replaces the plant's output, which need not be 0 at rest.
     pub fn replaces_output(&self) -> bool {
         self.ties.iter().any(|t| t.replaces_output())

@@ -74,9 +74,6 @@ pub trait Block: fmt::Debug + Send + Sync {
     /// Advances over a piece of `h_s` (zero: the input jumps, no time passes) that begins at `time_s`.
     fn advance(&mut self, time_s: f64, h_s: f64, input: Piece) -> Piece;
 
-    /// Back to rest.
-    fn reset(&mut self);
-
     /// A copy with its state.
     fn duplicate(&self) -> Box<dyn Block>;
 
@@ -134,9 +131,6 @@ pub trait Around: fmt::Debug + Send + Sync {
 
     /// Advances its states over a piece.
     fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen);
-
-    /// Back to rest.
-    fn reset(&mut self);
 
     /// A copy with its state.
     fn duplicate(&self) -> Box<dyn Around>;

@@ -69,10 +69,6 @@ impl Block for Play {
         Piece::line(start, end, h_s)
     }
 
-    fn reset(&mut self) {
-        self.x = 0.0;
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

@@ -131,11 +131,6 @@ impl Block for Dissolving {
         }
     }
 
-    fn reset(&mut self) {
-        self.y = 0.0;
-        self.speed = 0.0;
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

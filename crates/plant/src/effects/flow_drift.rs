@@ -70,8 +70,6 @@ impl Block for Flow {
         }
     }
 
-    fn reset(&mut self) {}
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

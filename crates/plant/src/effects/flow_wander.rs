@@ -73,11 +73,6 @@ impl Block for Wander {
         }
     }
 
-    fn reset(&mut self) {
-        self.speed = 0.0;
-        self.way = 0.0;
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

@@ -71,10 +71,6 @@ impl Block for Drift {
         }
     }
 
-    fn reset(&mut self) {
-        self.area = 0.0;
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

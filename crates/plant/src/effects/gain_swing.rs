@@ -108,12 +108,6 @@ impl Block for Swing {
         }
     }
 
-    fn reset(&mut self) {
-        self.input = 0.0;
-        self.output = 0.0;
-        self.known = (f64::NAN, 0.0);
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

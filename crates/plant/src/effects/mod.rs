@@ -74,7 +74,7 @@ pub use parameter::{EffectError, Form, Parameter, ParameterSpec, Spec};
 pub use pdms_relaxation::{pdms_relaxation, pdms_relaxation_of_fast_gain};
 pub use pixel_locking::pixel_locking;
 pub use pump_pulsation::pump_pulsation;
-pub use pzt_creep::{pzt_creep, pzt_creep_from, pzt_creep_of_fast_gain, pzt_creep_of_lags_from};
+pub use pzt_creep::pzt_creep;
 pub use pzt_hysteresis::{Curve, bouc_wen, bouc_wen_explicit, curved_play, exponential_play, play};
 pub use pzt_resonance::pzt_resonance;
 pub use saturation::saturation;

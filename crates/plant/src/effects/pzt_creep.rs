@@ -16,22 +16,6 @@ pub fn pzt_creep(per_decade: f64) -> Effect {
     Effect::new(&PztCreep, AT_REST, &[per_decade], &[])
 }
 
-/// The same creep for a model with the gain of fast motion: `x = x0 (1 + g log10(t / 1 ms))`.
-pub fn pzt_creep_of_fast_gain(per_decade: f64) -> Effect {
-    Effect::new(&PztCreep, AT_SPEED, &[per_decade], &[])
-}
-
-/// Creep that begins some time after a step: `x = x0 (1 + g log10(1 + t/onset))`, for a model with the gain before that.
-pub fn pzt_creep_from(per_decade: f64, onset_s: f64) -> Effect {
-    Effect::new(&PztCreep, WITH_ONSET, &[per_decade, onset_s], &[])
-}
-
-/// Creep whose lags begin sharply at `onset_s`: the response has the factor `1 + g log10(1 + 1/(onset s))`, for a model with the gain
-/// before that.
-pub fn pzt_creep_of_lags_from(per_decade: f64, onset_s: f64) -> Effect {
-    Effect::new(&PztCreep, WITH_SHARP_ONSET, &[per_decade, onset_s], &[])
-}
-
 /// The model's gain is that of a step after 0.1 s.
 const AT_REST: usize = 0;
 /// The model's gain is that of a step after 1 ms.

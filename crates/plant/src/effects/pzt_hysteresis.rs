@@ -405,11 +405,6 @@ impl Block for BoucWen {
         followed(h_s, input, |u| self.follow(u))
     }
 
-    fn reset(&mut self) {
-        self.h = 0.0;
-        self.input = 0.0;
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }
@@ -478,10 +473,6 @@ impl Play {
 impl Block for Play {
     fn advance(&mut self, _: f64, h_s: f64, input: Piece) -> Piece {
         followed(h_s, input, |u| self.follow(u))
-    }
-
-    fn reset(&mut self) {
-        self.p.fill(0.0);
     }
 
     fn duplicate(&self) -> Box<dyn Block> {

@@ -25,9 +25,6 @@ pub(crate) trait SpeedLaw: fmt::Debug + Clone + Send + Sync + 'static {
     fn switches(&self) -> bool {
         false
     }
-
-    /// Back to rest.
-    fn reset(&mut self) {}
 }
 
 /// A block with a law of the speed.
@@ -68,11 +65,6 @@ impl<L: SpeedLaw> Block for OfSpeed<L> {
             speed_start: self.law.speed(input.speed_start),
             speed_end: self.law.speed(input.speed_end),
         }
-    }
-
-    fn reset(&mut self) {
-        (self.input, self.output) = (0.0, 0.0);
-        self.law.reset();
     }
 
     fn duplicate(&self) -> Box<dyn Block> {

@@ -143,8 +143,4 @@ impl SpeedLaw for Stick {
     fn switches(&self) -> bool {
         true
     }
-
-    fn reset(&mut self) {
-        self.stuck = true;
-    }
 }

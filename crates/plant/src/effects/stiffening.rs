@@ -109,8 +109,6 @@ impl Block for Stiff {
         Piece::line(at(input.start), at(input.end), h_s)
     }
 
-    fn reset(&mut self) {}
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

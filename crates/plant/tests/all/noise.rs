@@ -109,25 +109,6 @@ fn row_by_row_and_whole_records_are_the_same_to_the_bit() {
         assert_eq!(simulator.measure().to_bits(), y.to_bits());
         simulator.hold(*u);
     }
-    assert_eq!(simulator.row(), 200);
-}
-
-#[test]
-fn brownian_motion_is_switched_off_and_the_bead_is_put_elsewhere() {
-    let mut chain = Chain::with_brownian_motion(&Model::eq6(), 4).unwrap();
-    chain.advance(4.0, 1e-3);
-    let moved = chain.bead_um();
-    assert!(moved != 0.0);
-    chain.set_brownian_motion(false);
-    chain.advance(4.0, 1e-3);
-    assert_eq!(chain.bead_um(), moved);
-    chain.place_bead(12.5);
-    assert!((chain.bead_um() - 12.5).abs() < 1e-12);
-    chain.reset();
-    assert_eq!(
-        (chain.bead_um(), chain.time_s(), chain.pzt_um()),
-        (0.0, 0.0, 4.0)
-    );
 }
 
 #[test]

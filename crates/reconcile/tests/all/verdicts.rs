@@ -396,8 +396,6 @@ impl Block for Square {
         Piece::line(at(input.start), at(input.end), h_s)
     }
 
-    fn reset(&mut self) {}
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }

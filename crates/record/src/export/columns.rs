@@ -338,11 +338,6 @@ pub fn of_law(names: &[String]) -> Vec<Column<'_>> {
         .collect()
 }
 
-/// A column by its name.
-pub fn find(name: &str) -> Option<&'static Column<'static>> {
-    COLUMNS.iter().find(|column| column.name == name)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -16,19 +16,22 @@ use crate::timing::Timing;
 
 use cellpos_control::{ControllerFile, Limits, Pi};
 use cellpos_drivers::{BoardHost, Port};
-use cellpos_emulator::{BoardConfig, LineFaults, MisbehavingLine, RigInABox, WorldConfig};
+use cellpos_emulator::{BoardConfig, RigInABox, WorldConfig};
 use cellpos_plant::{Model, TransferFunction};
 use cellpos_rig::{ArmRequest, CameraError, CommandAccount, SourceInfo};
 use rtrb::RingBuffer;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 
+mod line;
+mod misbehaving_line;
 mod peers;
 mod rig;
 mod scheduler;
 mod slow_vision;
 mod stops;
 
+use misbehaving_line::{LineFaults, MisbehavingLine};
 use peers::*;
 use rig::*;
 use scheduler::*;

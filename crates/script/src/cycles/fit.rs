@@ -103,7 +103,7 @@ pub(super) fn recovery_s(points: &[(f64, f64)]) -> Option<f64> {
         }
     };
     let (low, high) = ((span_s * 1e-3).ln(), (span_s * 3.0).ln());
-    minimum(low, high, 24, 40, cost).map(f64::exp)
+    minimum(low, high, 24, cost).map(f64::exp)
 }
 
 #[cfg(test)]

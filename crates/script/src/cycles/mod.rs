@@ -94,11 +94,6 @@ impl CycleTable {
         }
     }
 
-    /// The running cycle or the next one.
-    pub fn current(&self) -> u64 {
-        self.next
-    }
-
     /// The next finished row.
     pub fn pop(&mut self) -> Option<CycleRow> {
         self.ready.pop_front()

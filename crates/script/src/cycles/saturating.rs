@@ -37,7 +37,7 @@ pub(super) fn fit(points: &[(f64, f64)], line: f64) -> Option<Saturating> {
     }
     let cost = |log: f64| solve(points, first, log.exp()).map_or(f64::INFINITY, |(_, _, sum)| sum);
     let (low, high) = ((0.5f64).ln(), span.ln());
-    let cycles = minimum(low, high, 40, 50, cost)?.exp();
+    let cycles = minimum(low, high, 40, cost)?.exp();
     let (start, end, sum) = solve(points, first, cycles)?;
     let n = points.len() as f64;
     let variance = sum / (n - 3.0);

@@ -1,5 +1,6 @@
 //! A session from open to finished, on the emulated rig, with devices in between that misbehave and record their calls.
 
+use cellpos_control::{ControlLaw, Controller, LawInput, LawOutput};
 use cellpos_emulator::EmulatedRig;
 use cellpos_plant::Model;
 use cellpos_rig::{
@@ -7,10 +8,7 @@ use cellpos_rig::{
     Clock, Measurement, PositionSource, SourceInfo,
 };
 use cellpos_runtime::life::Refusal;
-use cellpos_runtime::{
-    EndRule, Event, NoSink, ReferenceGenerator, ReferenceInput, ReferenceOutput, Request, RunSink,
-    Stage, Statistics, TickRecord,
-};
+use cellpos_runtime::{EndRule, Event, NoSink, Request, RunSink, Statistics, TickRecord};
 use cellpos_session::rig_file::{ClockKind, Frames};
 use cellpos_session::setup::{ReferenceSpec, Setup};
 use cellpos_session::{EndKind, Options, Rig, RigFile};
@@ -185,20 +183,21 @@ fn an_answer_to_arm_that_is_not_this_session_armed_is_refused_and_disarmed() {
     }
 }
 
-/// A defect in a reference generator.
+/// A control law with a defect.
+#[derive(Debug, Clone)]
 struct Broken;
 
-impl ReferenceGenerator for Broken {
-    fn step(&mut self, input: &ReferenceInput, preview_um: &mut [f64]) -> ReferenceOutput {
-        assert!(input.tick < 100, "a defect");
-        preview_um.fill(0.0);
-        ReferenceOutput {
-            reference_um: 0.0,
-            plan_ns: -1,
-            stage: Stage::None,
-            phase: None,
-            motion: 0,
-        }
+impl ControlLaw for Broken {
+    type State = u32;
+
+    fn start(&self, _: f64) -> u32 {
+        0
+    }
+
+    fn step(&self, ticks: &mut u32, input: &LawInput) -> LawOutput {
+        *ticks += 1;
+        assert!(*ticks < 100, "a defect");
+        LawOutput::wish(input.estimate.neutral_um)
     }
 }
 
@@ -207,7 +206,9 @@ fn a_panic_in_the_loop_is_an_error_and_the_board_is_disarmed() {
     for clock in [ClockKind::Virtual, ClockKind::Real] {
         let (mut rig, log) = rig(clock, |_| {}, |_| {});
         let setup = set_up(&mut rig);
-        let core = setup.core_following(Broken).expect("a loop");
+        let parts = setup.law().expect("a law").settings().with(Broken);
+        let law = Controller::with_law(parts).expect("columns");
+        let core = setup.core_with(law).expect("a loop");
         let armed = rig.arm(&setup, core, NoSink, ticks(3000)).ok();
         let ended = armed.expect("armed").start().and_then(|run| run.wait());
         let failure = ended.err().expect("it panicked").text();

@@ -96,7 +96,7 @@ fn in_real_time(script: &str) -> bool {
     }) || script.contains("cargo run")
 }
 
-/// All pages, one after another; those in real time have the machine to themselves.
+/// All pages. Those in real time run one after another, alone among the tests in real time; the others meanwhile.
 fn run_pages(slow: bool) {
     let with_commands: Vec<(String, String)> = pages()
         .into_iter()
@@ -119,9 +119,14 @@ fn run_pages(slow: bool) {
             .filter_map(|(page, script)| run(page, script).err())
             .collect()
     };
-    let mut failed = run_all(simulated);
-    let _alone = programs::alone();
-    failed.extend(run_all(real));
+    let failed = std::thread::scope(|scope| {
+        let meanwhile = scope.spawn(|| run_all(simulated));
+        let alone = programs::alone();
+        let mut failed = run_all(real);
+        drop(alone);
+        failed.extend(meanwhile.join().unwrap());
+        failed
+    });
     assert!(failed.is_empty(), "{}", failed.join("\n\n"));
 }
 

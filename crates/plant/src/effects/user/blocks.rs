@@ -36,10 +36,6 @@ impl Block for Inline {
         Piece::line(start, end, h_s)
     }
 
-    fn reset(&mut self) {
-        self.core.reset();
-    }
-
     fn duplicate(&self) -> Box<dyn Block> {
         Box::new(self.clone())
     }
@@ -80,10 +76,6 @@ impl Around for Tied {
 
     fn advance(&mut self, h_s: f64, now: &Seen, then: &Seen) {
         self.core.advance(h_s, now, then);
-    }
-
-    fn reset(&mut self) {
-        self.core.reset();
     }
 
     fn duplicate(&self) -> Box<dyn Around> {

@@ -65,11 +65,6 @@ impl Core {
         !self.compiled.rates.is_empty()
     }
 
-    pub(super) fn reset(&mut self) {
-        self.states = self.start;
-        self.output = 0.0;
-    }
-
     fn values(&self, seen: &Seen, states: &[f64; MOST_STATES]) -> Values {
         let mut v: Values = [0.0; SIGNALS.len() + MOST];
         let [entering, position, given] = self.units;

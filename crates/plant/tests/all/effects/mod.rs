@@ -9,7 +9,6 @@ mod user;
 
 use cellpos_plant::{
     Chain, Complex, Effect, Hertz, Model, SimulateOptions, TransferFunction, effects, simulate,
-    simulate_at,
 };
 use std::f64::consts::{PI, TAU};
 

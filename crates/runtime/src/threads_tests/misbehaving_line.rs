@@ -8,19 +8,19 @@ use std::io::{Error, ErrorKind, Result};
 
 /// The faults of a line and their rates. The default is no fault.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LineFaults {
+pub(super) struct LineFaults {
     /// Stalls a second; the first frame after the start of a stall is cut in two.
-    pub stalls_per_s: f64,
+    pub(super) stalls_per_s: f64,
     /// Shortest and longest stall, ms. Their logarithm is uniform, so that short ones are frequent and long ones happen.
-    pub stall_ms: [f64; 2],
+    pub(super) stall_ms: [f64; 2],
     /// Probability that a write is taken in part.
-    pub part: f64,
+    pub(super) part: f64,
     /// Probability that a byte is lost, in either direction.
-    pub byte_loss: f64,
+    pub(super) byte_loss: f64,
     /// Times at which the line is unplugged and back, ns of the clock.
-    pub unplugged_ns: Vec<[i64; 2]>,
+    pub(super) unplugged_ns: Vec<[i64; 2]>,
     /// Start and end of scheduled stalls, besides the random ones, ns of the clock.
-    pub stalled_ns: Vec<[i64; 2]>,
+    pub(super) stalled_ns: Vec<[i64; 2]>,
 }
 
 impl Default for LineFaults {
@@ -39,7 +39,7 @@ impl Default for LineFaults {
 impl LineFaults {
     /// The same faults with their times counted from `start_ns`.
     #[must_use]
-    pub fn from(&self, start_ns: i64) -> Self {
+    pub(super) fn from(&self, start_ns: i64) -> Self {
         let later = |spans: &[[i64; 2]]| {
             let later = |[from_ns, until_ns]: &[i64; 2]| [start_ns + from_ns, start_ns + until_ns];
             spans.iter().map(later).collect()
@@ -54,7 +54,7 @@ impl LineFaults {
 
 /// A line with faults in front of another one.
 #[derive(Debug, Clone)]
-pub struct MisbehavingLine<P> {
+pub(super) struct MisbehavingLine<P> {
     line: P,
     clock: Clock,
     faults: LineFaults,
@@ -67,7 +67,7 @@ pub struct MisbehavingLine<P> {
 
 impl<P> MisbehavingLine<P> {
     /// Puts faults in front of a line; `seed` fixes them.
-    pub fn new(line: P, clock: Clock, faults: LineFaults, seed: u64) -> Self {
+    pub(super) fn new(line: P, clock: Clock, faults: LineFaults, seed: u64) -> Self {
         let mut this = Self {
             dice: Random::stream(seed, 31),
             stall_ns: [i64::MAX; 2],
@@ -81,7 +81,7 @@ impl<P> MisbehavingLine<P> {
     }
 
     /// Sets other faults from now on.
-    pub fn misbehave(&mut self, faults: LineFaults) {
+    pub(super) fn misbehave(&mut self, faults: LineFaults) {
         self.faults = faults;
         self.draw_stall();
     }

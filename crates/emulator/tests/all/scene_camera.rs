@@ -17,73 +17,73 @@ const BLUR_POINTS: usize = 5;
 /// A bead of the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SceneBead {
+pub(crate) struct SceneBead {
     /// Start, column, px.
-    pub x_px: f64,
+    pub(crate) x_px: f64,
     /// Start, row, px.
-    pub y_px: f64,
+    pub(crate) y_px: f64,
     /// Steady velocity along the rows, px/s.
-    pub x_px_per_s: f64,
+    pub(crate) x_px_per_s: f64,
     /// Steady velocity along the columns, px/s.
-    pub y_px_per_s: f64,
+    pub(crate) y_px_per_s: f64,
     /// Diffusion coefficient, px^2/s.
-    pub diffusion_px2_per_s: f64,
+    pub(crate) diffusion_px2_per_s: f64,
     /// Edge radius in focus, px.
-    pub edge_px: f64,
+    pub(crate) edge_px: f64,
     /// Peak contrast in focus, grey levels.
-    pub amplitude_grey: f64,
+    pub(crate) amplitude_grey: f64,
 }
 
 /// A speck that does not move.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Dust {
+pub(crate) struct Dust {
     /// Column, px.
-    pub x_px: f64,
+    pub(crate) x_px: f64,
     /// Row, px.
-    pub y_px: f64,
+    pub(crate) y_px: f64,
     /// Size: standard deviation of a Gaussian, px.
-    pub sigma_px: f64,
+    pub(crate) sigma_px: f64,
     /// Grey levels taken off at its centre.
-    pub depth_grey: f64,
+    pub(crate) depth_grey: f64,
 }
 
 /// A scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct SceneConfig {
+pub(crate) struct SceneConfig {
     /// Pixels per row.
-    pub width_px: usize,
+    pub(crate) width_px: usize,
     /// Rows.
-    pub height_px: usize,
+    pub(crate) height_px: usize,
     /// Frame rate, Hz.
-    pub rate_hz: f64,
+    pub(crate) rate_hz: f64,
     /// Exposure as a share of the frame interval, 0 to 1.
-    pub exposure_share: f64,
+    pub(crate) exposure_share: f64,
     /// Light at the middle of the frame, grey levels.
-    pub background_grey: f64,
+    pub(crate) background_grey: f64,
     /// Change of the light across the frame's width, as a fraction.
-    pub light_slope: f64,
+    pub(crate) light_slope: f64,
     /// Light missing in the corners, as a fraction.
-    pub vignette: f64,
+    pub(crate) vignette: f64,
     /// Amplitude of the light's flicker, as a fraction.
-    pub flicker: f64,
+    pub(crate) flicker: f64,
     /// Frequency of the flicker, Hz.
-    pub flicker_hz: f64,
+    pub(crate) flicker_hz: f64,
     /// Amplitude of the beads' change of size by defocus, as a fraction; their contrast falls with their area.
-    pub defocus: f64,
+    pub(crate) defocus: f64,
     /// Frequency of the defocus, Hz.
-    pub defocus_hz: f64,
+    pub(crate) defocus_hz: f64,
     /// Standard deviation of the noise without light, grey levels.
-    pub read_sd_grey: f64,
+    pub(crate) read_sd_grey: f64,
     /// Shot noise: grey levels per photo-electron.
-    pub shot_grey_per_electron: f64,
+    pub(crate) shot_grey_per_electron: f64,
     /// Beads; the first is the one whose truth is stamped.
-    pub beads: Vec<SceneBead>,
+    pub(crate) beads: Vec<SceneBead>,
     /// Dust.
-    pub dust: Vec<Dust>,
+    pub(crate) dust: Vec<Dust>,
     /// Seed.
-    pub seed: u64,
+    pub(crate) seed: u64,
 }
 
 impl Default for SceneConfig {
@@ -134,18 +134,18 @@ impl Default for SceneConfig {
 /// A scene that cannot be rendered.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("scene: {key} = {value}: must be {must_be}")]
-pub struct SceneError {
+pub(crate) struct SceneError {
     /// Which key.
-    pub key: &'static str,
+    pub(crate) key: &'static str,
     /// Its value.
-    pub value: f64,
+    pub(crate) value: f64,
     /// What would be right.
-    pub must_be: &'static str,
+    pub(crate) must_be: &'static str,
 }
 
 /// The camera of the scene.
 #[derive(Debug)]
-pub struct SceneCamera {
+pub(crate) struct SceneCamera {
     config: SceneConfig,
     profiles: Vec<RingProfile>,
     /// Where the beads are at the middle of the newest exposure, px.
@@ -163,7 +163,7 @@ impl SceneCamera {
     ///
     /// # Errors
     /// The error names the first invalid key.
-    pub fn new(config: SceneConfig, clock: Clock) -> Result<Self, SceneError> {
+    pub(crate) fn new(config: SceneConfig, clock: Clock) -> Result<Self, SceneError> {
         let range = |key, value: f64, low: f64, high: f64, must_be| {
             if value >= low && value <= high {
                 Ok(())
@@ -256,7 +256,7 @@ impl SceneCamera {
     }
 
     /// Positions of the beads in the newest frame (middle of the exposure), px.
-    pub fn places(&self) -> &[(f64, f64)] {
+    pub(crate) fn places(&self) -> &[(f64, f64)] {
         &self.places
     }
 

@@ -1,8 +1,8 @@
 //! The host's side of the board over a line that stalls, takes half a frame, loses bytes, is unplugged and comes back.
 
+use super::{LineFaults, MisbehavingLine};
 use cellpos_board::{Board, Config};
 use cellpos_drivers::{BoardHost, Port};
-use cellpos_emulator::{LineFaults, MisbehavingLine};
 use cellpos_link::{Command, Decoder, ToBoard};
 use cellpos_rig::{Actuator, ArmRequest, Clock};
 use std::sync::{Arc, Mutex};
