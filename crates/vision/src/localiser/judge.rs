@@ -207,6 +207,13 @@ impl Localiser {
         } else {
             (self.widening_by_pixels(own, freedom), observed)
         };
+        let is_wide = self.template.radius_px() >= UNRESOLVED_PX;
+        let widening = if is_wide && self.comb.is_still() {
+            let stated = self.pixel_variance(fix.background) * widening;
+            widening * self.alike.beyond(left.bends(stated))
+        } else {
+            widening
+        };
         // One window tells it with noise; the last fixes have been in a like focus.
         let answer = if self.comb.is_still() || more {
             self.answers.shrink(answer, 1.0, POOLED_FIXES)
@@ -229,12 +236,9 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         let parts = (fix.amplitude, background);
         let seen = observed::of(&self.crop, &self.template, (fix.x_px, fix.y_px), parts);
-        // In the noise that windows have in common: what is pooled would vary with that of each window.
         let variance = self.pixel_variance(fix.background);
         let common = self.noises.common().unwrap_or(variance);
-        self.scatter
-            .take_in(seen.scatter / (self.white_scatter * common));
-        self.scatter_here = self.scatter.mean * common / variance;
+        self.alike.take_scatter(seen.scatter, common, variance);
         seen.answer
     }
 
@@ -308,7 +312,7 @@ impl Localiser {
         } else {
             1.0
         };
-        self.scatter_here.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
+        self.alike.here.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
     }
 
     /// Part of the whole window that the bead fills, for the tolerance of a template's error: see [`filled`].
