@@ -31,6 +31,16 @@ const SPOILT: f64 = 0.01;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
 const LEAST_EXPLAINED: f64 = 0.5;
 
+/// Light that rises across the window.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Rise {
+    /// Along the row and along the column, grey levels a px.
+    pub slope: (f64, f64),
+    /// Squares of the ways by which fitting it has moved the place, times what it leaves over what it explains: the light of a speck
+    /// in a corner is drawn into a slope that does not go on under the bead.
+    pub way_px2: [f64; 2],
+}
+
 impl Localiser {
     /// The verdict of a fit, and its figures.
     pub(super) fn judge(&self, frame: &Frame, fitted: Option<Fitted>, guess: (f64, f64)) -> Fix {
@@ -242,13 +252,14 @@ impl Localiser {
         seen.answer
     }
 
-    /// Adds what light that rises by a slope along row and column, grey levels a px, may have moved the fix by: whether it is the light
-    /// that the bead is seen by, nobody says.
-    pub(super) fn add_shading(&self, fix: &mut Fix, slope: (f64, f64)) {
+    /// Adds what light that rises along row and column may have moved the fix by: whether it is the light that the bead is seen by,
+    /// nobody says, and whether it rises evenly, what is left says.
+    pub(super) fn add_rise(&self, fix: &mut Fix, rise: &Rise) {
         let moves = |slope: f64| self.shading_px2 * slope / fix.background.max(1.0);
-        let (x_px, y_px) = (moves(slope.0), moves(slope.1));
-        fix.var_x_px2 += x_px * x_px;
-        fix.var_y_px2 += y_px * y_px;
+        let (x_px, y_px) = (moves(rise.slope.0), moves(rise.slope.1));
+        let [of_x, of_y] = rise.way_px2;
+        fix.var_x_px2 += x_px * x_px + of_x;
+        fix.var_y_px2 += y_px * y_px + of_y;
     }
 
     /// The same where it leaves more than noise: what patches and pixels leave besides their mean all round. That mean tells how

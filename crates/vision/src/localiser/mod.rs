@@ -25,6 +25,7 @@ use crate::speckle;
 use crate::streak::{Comb, Way};
 use crate::template::Template;
 use alike::Alike;
+use judge::Rise;
 use view::View;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
@@ -101,8 +102,8 @@ struct Fitted {
     y_px: f64,
     pass: Pass,
     converged: bool,
-    /// Rise of the light along the row and along the column, where it was fitted, grey levels a px.
-    slope: (f64, f64),
+    /// Light that rises across the window, where it was fitted.
+    rise: Rise,
     /// What it leaves, where that was looked at.
     left: Left,
 }
@@ -115,7 +116,7 @@ impl Fitted {
             pass,
             converged,
             left: Left::default(),
-            slope: (0.0, 0.0),
+            rise: Rise::default(),
         }
     }
 }
@@ -351,7 +352,7 @@ impl Localiser {
         }
         let found = fitted.as_ref().map(|f| f.pass);
         let left = fitted.as_ref().map_or(Left::default(), |f| f.left);
-        let slope = fitted.as_ref().map_or((0.0, 0.0), |f| f.slope);
+        let rise = fitted.as_ref().map_or(Rise::default(), |f| f.rise);
         let mut fix = self.judge(view.frame, fitted, (x_px, y_px));
         if fix.verdict == FixQuality::BadFit && view.pardons {
             self.pardon(view.frame, &mut fix);
@@ -360,7 +361,7 @@ impl Localiser {
             return fix;
         }
         let widening = self.widen(&mut fix, &left);
-        self.add_shading(&mut fix, slope);
+        self.add_rise(&mut fix, &rise);
         if fix.verdict == FixQuality::Good
             && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
         {
