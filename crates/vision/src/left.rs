@@ -65,9 +65,9 @@ impl Left {
         fibre::explains(crop, at, radius_px, (cos, sin), sign) > self.contrast
     }
 
-    /// Squares of the scores of a stretch along row and diagonal, for noise of a variance.
-    pub(crate) fn bends(&self, variance: f64) -> [f64; 2] {
-        self.stretch.map(|score| score * score / variance)
+    /// Scores of a stretch along row and diagonal, relative to a contrast.
+    pub(crate) fn bends(&self, contrast: f64) -> [f64; 2] {
+        self.stretch.map(|score| score / contrast)
     }
 
     /// What light that rises and another size would take off the sum of squares, grey^2.

@@ -26,7 +26,8 @@ pub(super) struct Alike {
     /// Scatter of white noise of variance 1.
     white: f64,
     /// Squares of the bends along the row and along the diagonal, over the variance that is stated without them.
-    bends: [Pool; 2],
+    /// Those of beads that were not seen before, and of others besides their own look.
+    bends: [[Pool; 2]; 2],
 }
 
 impl Alike {
@@ -35,7 +36,7 @@ impl Alike {
             scatter: Pool::default(),
             here: 1.0,
             white: observed::of_white(template, window_px),
-            bends: [Pool::known(1.0, WHITE_FIXES); 2],
+            bends: [[Pool::known(1.0, WHITE_FIXES); 2]; 2],
         }
     }
 
@@ -53,14 +54,15 @@ impl Alike {
 
     /// By how much the place scatters more than stated, by this fix's bends over the stated variance, and those of the last. Both bends
     /// have it. Offsets of rows and columns, which are stated apart, have only the first.
-    pub(super) fn beyond(&mut self, bends: [f64; 2]) -> f64 {
-        let usual: f64 = self.bends.iter().map(|pool| pool.mean).sum();
+    pub(super) fn beyond(&mut self, bends: [f64; 2], is_known: bool) -> f64 {
+        let pools = &mut self.bends[usize::from(is_known)];
+        let usual: f64 = pools.iter().map(|pool| pool.mean).sum();
         let now: f64 = bends.iter().sum();
         let cut = (MOST * usual / now.max(f64::MIN_POSITIVE)).min(1.0) / (1.0 - (-MOST).exp());
-        for (pool, bend) in self.bends.iter_mut().zip(bends) {
+        for (pool, bend) in pools.iter_mut().zip(bends) {
             pool.take_in(cut * bend);
         }
-        let [row, diagonal] = self.bends.map(|pool| pool.mean);
+        let [row, diagonal] = pools.map(|pool| pool.mean);
         row.min(diagonal).max(1.0)
     }
 }
@@ -80,7 +82,7 @@ mod tests {
         let mut random = Random::new(3);
         let mut mean = 0.0;
         for k in 0..400 {
-            let found = alike.beyond(variances(k).map(|v| v * random.normal().powi(2)));
+            let found = alike.beyond(variances(k).map(|v| v * random.normal().powi(2)), false);
             mean += if k < 100 { 0.0 } else { found / 300.0 };
         }
         mean

@@ -211,18 +211,11 @@ impl Localiser {
         let locally = self.local.moderate(own, freedom);
         let more = fix.residual_ratio > WIDENED_RATIO || locally > WIDENED_LOCALLY;
         let (widening, answer) = if more {
-            let (widening, of_rings) = self.widening_by_what_is_left(fix);
+            let (widening, of_rings) = self.widening_by_what_is_left(fix, left);
             let by_rings = self.template.radius_px() >= UNRESOLVED_PX || !self.comb.is_still();
             (widening, if by_rings { of_rings } else { observed })
         } else {
             (self.widening_by_pixels(own, freedom), observed)
-        };
-        let is_wide = self.template.radius_px() >= UNRESOLVED_PX;
-        let widening = if is_wide && self.comb.is_still() {
-            let stated = self.pixel_variance(fix.background) * widening;
-            widening * self.alike.beyond(left.bends(stated))
-        } else {
-            widening
         };
         // One window tells it with noise; the last fixes have been in a like focus.
         let answer = if self.comb.is_still() || more {
@@ -264,12 +257,13 @@ impl Localiser {
 
     /// The same where it leaves more than noise: what patches and pixels leave besides their mean all round. That mean tells how
     /// much steeper the template is than the bead.
-    fn widening_by_what_is_left(&mut self, fix: &Fix) -> (f64, f64) {
+    fn widening_by_what_is_left(&mut self, fix: &Fix, left: &Left) -> (f64, f64) {
         let at = (fix.x_px, fix.y_px);
         let background = fix.background - f64::from(self.crop.pedestal);
         let variance = self.pixel_variance(fix.background);
         // In the noise that windows have in common: what is pooled would vary with that of each window.
         let common = self.noises.common().unwrap_or(variance);
+        self.residues.bends = left.bends(fix.amplitude);
         let by_patches = self.residues.widening(
             &self.crop,
             &self.template,
@@ -279,7 +273,12 @@ impl Localiser {
             common,
         );
         let by_patches = by_patches.map_or(fix.residual_ratio, |w| w * common / variance);
-        let by_patches = by_patches.max(1.0);
+        let mut by_patches = by_patches.max(1.0);
+        if self.template.radius_px() >= UNRESOLVED_PX && self.comb.is_still() {
+            let stated = by_patches * variance / (fix.amplitude * fix.amplitude);
+            let bends = self.residues.bends.map(|bend| bend * bend / stated);
+            by_patches *= self.alike.beyond(bends, self.residues.is_known);
+        }
         let (local, answer) = self.residues.besides_the_mean(
             &self.crop,
             &self.template,

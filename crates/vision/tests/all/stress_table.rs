@@ -229,6 +229,7 @@ impl Limits {
         let narrow = profile.radius_px() < 4.5;
         let lies = match spoil {
             Spoil::Jpeg if profile.radius_px() < 2.5 => 0.02,
+            Spoil::Jpeg if narrow => 5e-3,
             Spoil::Dust | Spoil::HotPixels if narrow => 0.02,
             Spoil::Neighbours | Spoil::Saturation if narrow => 0.02,
             _ => 1e-3,
