@@ -65,6 +65,11 @@ impl Left {
         fibre::explains(crop, at, radius_px, (cos, sin), sign) > self.contrast
     }
 
+    /// Scores of a stretch along row and diagonal, relative to a contrast.
+    pub(crate) fn bends(&self, contrast: f64) -> [f64; 2] {
+        self.stretch.map(|score| score / contrast)
+    }
+
     /// What light that rises and another size would take off the sum of squares, grey^2.
     pub(crate) fn explained_by_slope_and_size(&self) -> f64 {
         self.scores.iter().map(|score| score * score).sum()

@@ -51,6 +51,7 @@ pub mod profile;
 mod range;
 mod reach;
 mod residue;
+mod rings;
 mod seed;
 mod smooth;
 mod speckle;

@@ -11,6 +11,11 @@ pub(crate) struct Pool {
 }
 
 impl Pool {
+    /// A mean that is known as from so many fixes.
+    pub(crate) fn known(mean: f64, fixes: f64) -> Self {
+        Pool { mean, fixes }
+    }
+
     pub(crate) fn take_in(&mut self, value: f64) {
         self.fixes += 1.0;
         self.mean += (value - self.mean) * (1.0 / self.fixes).max(FORGETTING);

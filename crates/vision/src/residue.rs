@@ -8,6 +8,7 @@ use crate::config::MAX_WINDOW_PX;
 use crate::crop::{Crop, LANES, Row, STRIDE};
 use crate::fit::Image;
 use crate::pool::Scales;
+use crate::rings::{RINGS, take_off_radial_mean};
 use crate::streak::Comb;
 use crate::template::Template;
 use nalgebra::{Matrix2, Vector2};
@@ -20,8 +21,6 @@ const LARGEST_PATCH_RADII: f64 = 0.8;
 /// Share of even noise's variance that is left in a patch of values between the pixels; of noise that neighbours have in common more is
 /// left, of one that all have, all.
 const INTERPOLATED: f64 = 0.83;
-/// Whole distances from a bead that a window holds.
-const RINGS: usize = 2 * STRIDE;
 /// Most patches in a window.
 const MAX_PATCHES: usize = 256;
 /// Share of a new fix in a bead's running look.
@@ -52,6 +51,8 @@ struct Look {
     /// Half the window that the scores are from: of another one they are not comparable.
     half: usize,
     mean: Scores,
+    /// Its bends, relative to its contrast.
+    bends: [f64; 2],
 }
 
 impl Look {
@@ -64,6 +65,7 @@ impl Look {
         frame: 0,
         half: 0,
         mean: [[0.0; 2]; MAX_PATCHES],
+        bends: [0.0; 2],
     };
 }
 
@@ -79,6 +81,9 @@ pub(crate) struct Residues {
     /// Room for what the template leaves of a window, and its mean at whole distances from the bead, px.
     pub left: Box<[Row; MAX_WINDOW_PX]>,
     rings: Box<[f32; RINGS]>,
+    /// Bends of the window at hand over its contrast, and whether the bead's own are taken off: [`Residues::widening`] does.
+    pub bends: [f64; 2],
+    pub is_known: bool,
 }
 
 impl Residues {
@@ -90,6 +95,8 @@ impl Residues {
             pooled: [Scales::default(); 2],
             left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
             rings: Box::new([0.0; RINGS]),
+            bends: [0.0; 2],
+            is_known: false,
         }
     }
 
@@ -142,8 +149,18 @@ impl Residues {
                 relative * own * kept,
             )?);
         }
+        let (seen, look_bends) = (self.bends, look.bends);
+        self.is_known = !is_new;
+        if !is_new {
+            for (bend, mean) in self.bends.iter_mut().zip(look_bends) {
+                *bend = (*bend - mean) / own.sqrt();
+            }
+        }
         let pool = &mut self.pooled[usize::from(!is_new)];
         if !again {
+            for (mean, bend) in look.bends.iter_mut().zip(seen) {
+                *mean += forgetting * (bend - *mean);
+            }
             for (mean, score) in look.mean.iter_mut().zip(&scores) {
                 for (m, s) in mean.iter_mut().zip(score) {
                     *m += forgetting as f32 * (s - *m);
@@ -398,48 +415,6 @@ fn in_common(crop: &Crop, left: &[Row]) -> f64 {
         }
     }
     f64::from(products / squares.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)
-}
-
-/// Takes the mean over each ring about the centre off what the template leaves: that of a template of another focus or size,
-/// which does not move the position.
-fn take_off_radial_mean(
-    crop: &Crop,
-    (x, y): (f32, f32),
-    left: &mut [Row],
-    sums: &mut [f32; RINGS],
-) {
-    let place = |i: usize, j: usize| {
-        // Neither `hypot` nor `fract`: both are calls of a library.
-        let (dx, dy) = (i as f32 - x, j as f32 - y);
-        let u = (dx * dx + dy * dy).sqrt();
-        let whole = u as usize;
-        (whole, u - whole as f32)
-    };
-    *sums = [0.0; RINGS];
-    let mut weights = [0.0_f32; RINGS];
-    for (j, row) in left.iter().enumerate().take(crop.height) {
-        for (i, v) in row.iter().enumerate().take(crop.width) {
-            let (k, t) = place(i, j);
-            if k + 1 < RINGS {
-                sums[k] += (1.0 - t) * v;
-                weights[k] += 1.0 - t;
-                sums[k + 1] += t * v;
-                weights[k + 1] += t;
-            }
-        }
-    }
-    for (sum, weight) in sums.iter_mut().zip(&weights) {
-        // A ring of few pixels would take their own noise off.
-        *sum = if *weight > 6.0 { *sum / weight } else { 0.0 };
-    }
-    for (j, row) in left.iter_mut().enumerate().take(crop.height) {
-        for (i, v) in row.iter_mut().enumerate().take(crop.width) {
-            let (k, t) = place(i, j);
-            if k + 1 < RINGS {
-                *v -= sums[k] + t * (sums[k + 1] - sums[k]);
-            }
-        }
-    }
 }
 
 #[cfg(test)]

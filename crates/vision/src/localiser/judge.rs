@@ -31,6 +31,16 @@ const SPOILT: f64 = 0.01;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
 const LEAST_EXPLAINED: f64 = 0.5;
 
+/// Light that rises across the window.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Rise {
+    /// Along the row and along the column, grey levels a px.
+    pub slope: (f64, f64),
+    /// Squares of the ways by which fitting it has moved the place, times what it leaves over what it explains: the light of a speck
+    /// in a corner is drawn into a slope that does not go on under the bead.
+    pub way_px2: [f64; 2],
+}
+
 impl Localiser {
     /// The verdict of a fit, and its figures.
     pub(super) fn judge(&self, frame: &Frame, fitted: Option<Fitted>, guess: (f64, f64)) -> Fix {
@@ -201,7 +211,7 @@ impl Localiser {
         let locally = self.local.moderate(own, freedom);
         let more = fix.residual_ratio > WIDENED_RATIO || locally > WIDENED_LOCALLY;
         let (widening, answer) = if more {
-            let (widening, of_rings) = self.widening_by_what_is_left(fix);
+            let (widening, of_rings) = self.widening_by_what_is_left(fix, left);
             let by_rings = self.template.radius_px() >= UNRESOLVED_PX || !self.comb.is_still();
             (widening, if by_rings { of_rings } else { observed })
         } else {
@@ -229,32 +239,31 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         let parts = (fix.amplitude, background);
         let seen = observed::of(&self.crop, &self.template, (fix.x_px, fix.y_px), parts);
-        // In the noise that windows have in common: what is pooled would vary with that of each window.
         let variance = self.pixel_variance(fix.background);
         let common = self.noises.common().unwrap_or(variance);
-        self.scatter
-            .take_in(seen.scatter / (self.white_scatter * common));
-        self.scatter_here = self.scatter.mean * common / variance;
+        self.alike.take_scatter(seen.scatter, common, variance);
         seen.answer
     }
 
-    /// Adds what light that rises by a slope along row and column, grey levels a px, may have moved the fix by: whether it is the light
-    /// that the bead is seen by, nobody says.
-    pub(super) fn add_shading(&self, fix: &mut Fix, slope: (f64, f64)) {
+    /// Adds what light that rises along row and column may have moved the fix by: whether it is the light that the bead is seen by,
+    /// nobody says, and whether it rises evenly, what is left says.
+    pub(super) fn add_rise(&self, fix: &mut Fix, rise: &Rise) {
         let moves = |slope: f64| self.shading_px2 * slope / fix.background.max(1.0);
-        let (x_px, y_px) = (moves(slope.0), moves(slope.1));
-        fix.var_x_px2 += x_px * x_px;
-        fix.var_y_px2 += y_px * y_px;
+        let (x_px, y_px) = (moves(rise.slope.0), moves(rise.slope.1));
+        let [of_x, of_y] = rise.way_px2;
+        fix.var_x_px2 += x_px * x_px + of_x;
+        fix.var_y_px2 += y_px * y_px + of_y;
     }
 
     /// The same where it leaves more than noise: what patches and pixels leave besides their mean all round. That mean tells how
     /// much steeper the template is than the bead.
-    fn widening_by_what_is_left(&mut self, fix: &Fix) -> (f64, f64) {
+    fn widening_by_what_is_left(&mut self, fix: &Fix, left: &Left) -> (f64, f64) {
         let at = (fix.x_px, fix.y_px);
         let background = fix.background - f64::from(self.crop.pedestal);
         let variance = self.pixel_variance(fix.background);
         // In the noise that windows have in common: what is pooled would vary with that of each window.
         let common = self.noises.common().unwrap_or(variance);
+        self.residues.bends = left.bends(fix.amplitude);
         let by_patches = self.residues.widening(
             &self.crop,
             &self.template,
@@ -264,7 +273,12 @@ impl Localiser {
             common,
         );
         let by_patches = by_patches.map_or(fix.residual_ratio, |w| w * common / variance);
-        let by_patches = by_patches.max(1.0);
+        let mut by_patches = by_patches.max(1.0);
+        if self.template.radius_px() >= UNRESOLVED_PX && self.comb.is_still() {
+            let stated = by_patches * variance / (fix.amplitude * fix.amplitude);
+            let bends = self.residues.bends.map(|bend| bend * bend / stated);
+            by_patches *= self.alike.beyond(bends, self.residues.is_known);
+        }
         let (local, answer) = self.residues.besides_the_mean(
             &self.crop,
             &self.template,
@@ -308,7 +322,7 @@ impl Localiser {
         } else {
             1.0
         };
-        self.scatter_here.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
+        self.alike.here.max(1.0) * (1.0 + spoilt * (ratio - 1.0))
     }
 
     /// Part of the whole window that the bead fills, for the tolerance of a template's error: see [`filled`].

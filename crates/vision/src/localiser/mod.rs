@@ -1,5 +1,6 @@
 //! Position of one bead in a frame: seed, template fit, covariance, verdict.
 
+mod alike;
 mod among;
 mod certainty;
 mod judge;
@@ -17,13 +18,14 @@ use crate::fix::{Fix, FixQuality};
 use crate::frame::Frame;
 use crate::learn::{Learner, LearningReport};
 use crate::left::Left;
-use crate::observed;
 use crate::pool::{Pool, Scales};
 use crate::residue::Residues;
 use crate::seed;
 use crate::speckle;
 use crate::streak::{Comb, Way};
 use crate::template::Template;
+use alike::Alike;
+use judge::Rise;
 use view::View;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.
@@ -78,11 +80,8 @@ pub struct Localiser {
     filled: [f64; 2],
     /// Variance where the place is read off, over that of the noise; and of the offsets of rows and columns, grey^2.
     local: Scales,
-    /// The same of the score of the place, which counts alike errors of neighbours; and what it is for white noise.
-    scatter: Pool,
-    /// By how much this fix's scatters more than for white noise of its window.
-    scatter_here: f64,
-    white_scatter: f64,
+    /// By how much errors of neighbours that are alike scatter the place more than white noise.
+    alike: Alike,
     lines: [Pool; 2],
     /// What the last fixes were widened by, and their residual ratios.
     widened: Pool,
@@ -103,8 +102,8 @@ struct Fitted {
     y_px: f64,
     pass: Pass,
     converged: bool,
-    /// Rise of the light along the row and along the column, where it was fitted, grey levels a px.
-    slope: (f64, f64),
+    /// Light that rises across the window, where it was fitted.
+    rise: Rise,
     /// What it leaves, where that was looked at.
     left: Left,
 }
@@ -117,7 +116,7 @@ impl Fitted {
             pass,
             converged,
             left: Left::default(),
-            slope: (0.0, 0.0),
+            rise: Rise::default(),
         }
     }
 }
@@ -133,7 +132,7 @@ impl Localiser {
         let learner = config
             .learning
             .map(|l| Learner::new(l, config.window_px, &template));
-        let white_scatter = observed::of_white(&template, config.window_px);
+        let alike = Alike::new(&template, config.window_px);
         let filled = judge::filled(&template, config.window_px);
         let shading_px2 = judge::shading_px2(&template, config.window_px);
         Ok(Localiser {
@@ -154,9 +153,7 @@ impl Localiser {
             shading_px2,
             filled,
             local: Scales::default(),
-            scatter: Pool::default(),
-            scatter_here: 1.0,
-            white_scatter,
+            alike,
             lines: [Pool::default(); 2],
             widened: Pool::default(),
             ratio: Scales::default(),
@@ -355,7 +352,7 @@ impl Localiser {
         }
         let found = fitted.as_ref().map(|f| f.pass);
         let left = fitted.as_ref().map_or(Left::default(), |f| f.left);
-        let slope = fitted.as_ref().map_or((0.0, 0.0), |f| f.slope);
+        let rise = fitted.as_ref().map_or(Rise::default(), |f| f.rise);
         let mut fix = self.judge(view.frame, fitted, (x_px, y_px));
         if fix.verdict == FixQuality::BadFit && view.pardons {
             self.pardon(view.frame, &mut fix);
@@ -364,7 +361,7 @@ impl Localiser {
             return fix;
         }
         let widening = self.widen(&mut fix, &left);
-        self.add_shading(&mut fix, slope);
+        self.add_rise(&mut fix, &rise);
         if fix.verdict == FixQuality::Good
             && !found.is_some_and(|p| self.is_certain(&p, (fix.x_px, fix.y_px), widening))
         {
@@ -428,7 +425,7 @@ impl Localiser {
         let background = fix.background - f64::from(self.crop.pedestal);
         if learner.take_in(&self.crop, (fix.x_px, fix.y_px), fix.amplitude, background) {
             learner.refresh(&mut self.template);
-            self.white_scatter = observed::of_white(&self.template, self.config.window_px);
+            self.alike.learn(&self.template, self.config.window_px);
             self.filled = judge::filled(&self.template, self.config.window_px);
             self.shading_px2 = judge::shading_px2(&self.template, self.config.window_px);
         }

@@ -1,6 +1,6 @@
 //! The steps after the first fit: specks are left out, and rising light and another focus are fitted if the window asks for them.
 
-use super::judge::WIDENED_RATIO;
+use super::judge::{Rise, WIDENED_RATIO};
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
@@ -97,11 +97,19 @@ impl Localiser {
         let Some((x_px, y_px, pass, slope)) = found else {
             return Some(f);
         };
+        // What chance leaves says nothing of the light's shape.
+        let explained = f.pass.chi2 - pass.chi2;
+        let chance = LEAST_EXCESS * (2.0 * pixels).sqrt() * self.weight_unit();
+        let doubt = ((misfit - explained - chance) / explained).max(0.0);
+        let rise = Rise {
+            slope,
+            way_px2: [x_px - f.x_px, y_px - f.y_px].map(|way| doubt * way * way),
+        };
         let found = Fitted {
             x_px,
             y_px,
             pass,
-            slope,
+            rise,
             ..f
         };
         Some(Fitted {
@@ -174,7 +182,7 @@ impl Localiser {
             y_px,
             pass: both.pass,
             converged: f.converged,
-            slope: f.slope,
+            rise: f.rise,
             left: f.left,
         };
         let left = self.left_by(&found);
