@@ -80,7 +80,8 @@ pub struct Scope {
 pub enum Role {
     /// In the chain, its numbers common to all records.
     Chain,
-    /// A line and its multiples, each with amplitude and phase per record. The first parameter is the frequency of the line, Hz.
+    /// A line and its multiples, each with amplitude and phase per record; amplitudes that differ from record to record cost. The first
+    /// parameter is the frequency of the line, Hz.
     Line {
         /// How many, the line itself among them.
         harmonics: usize,

@@ -272,3 +272,40 @@ pub(crate) fn strongest_line(ctx: &Context<'_>, fit: &Fit) -> Option<f64> {
     let spectra = Spectra::of(ctx, fit, &all, &simulated, highest_hz)?;
     spectra.strongest(1, LOWEST_HZ..highest_hz)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BINS: usize = 1000;
+    const LINE: usize = 500;
+
+    /// Two records with white innovations, a line of the same power in both, and responses that have the given power there.
+    fn spectra(responses: [f64; 2]) -> Spectra {
+        let with_line = |level: f64, line: f64| {
+            let mut powers = vec![level; BINS];
+            powers[LINE] = line;
+            powers
+        };
+        Spectra {
+            step_hz: 0.1,
+            apart: 4,
+            whole: with_line(4.0, 2000.0),
+            records: responses
+                .map(|response| [with_line(2.0, 1000.0), with_line(10.0, response)])
+                .to_vec(),
+            parts: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_line_that_one_record_hides_in_its_response_is_told_by_another() {
+        let frequency_hz = 0.1 * LINE as f64;
+        let found = |responses| spectra(responses).strongest(1, 40.0..60.0);
+        assert_eq!(found([10.0, 10.0]), Some(frequency_hz));
+        assert_eq!(found([1e7, 10.0]), Some(frequency_hz));
+        assert_eq!(found([1e7, 1e7]), None);
+        // More than an equation known to a tenth leaves of a response.
+        assert_eq!(found([1e4, 1e4]), Some(frequency_hz));
+    }
+}
