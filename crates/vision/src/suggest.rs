@@ -104,7 +104,7 @@ pub enum NothingToSuggest {
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
 ///
 /// # Errors
-/// Nothing stands out, or what does is not alike, or not round.
+/// Nothing stands out, or what does is not alike, not round, or too faint.
 pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
     found_in_scene(frames, |flats| suggest_in(frames, flats))
 }

@@ -5,7 +5,8 @@
 //! beads do not help, and two halves of the beads confirm it in each other (Henderson, PNAS 110, 18037, 2013, on pictures of
 //! particles in noise). So a pixel says nothing about the profile at a place that it has chosen. The pixels have the colours of a
 //! chessboard; those of each colour are taken at the places that fit those of the other colour best. Noise that is separate from
-//! pixel to pixel then shows nothing, and the two places of a bead tell how large the error of a place is.
+//! pixel to pixel then shows nothing, and a bead's two places tell how
+//! large the error is.
 
 use crate::config::Polarity;
 use crate::fix::squared;
