@@ -42,7 +42,7 @@ pub(crate) struct Object {
 pub(crate) struct OfBead {
     pub x_px: f64,
     pub y_px: f64,
-    /// Distance from the bead, px.
+    /// Distance from the bead's place for this pixel, px.
     pub r_px: f64,
     pub grey: f64,
 }
@@ -53,8 +53,12 @@ pub(crate) struct Bead {
     pub at: Object,
     /// Contrast of its image, in those of the others.
     pub contrast: f64,
+    /// Contrast of its image with its sign, grey levels; 0 of what has no good fix.
+    pub image: f64,
     /// Whether the profile is learnt from it.
     pub counts: bool,
+    /// Its place for the pixels of either colour of a chessboard, px: [`Bead::place_for`].
+    pub places: [(f64, f64); 2],
     /// Places of the objects about it, px.
     others: Vec<(f64, f64)>,
 }
@@ -72,9 +76,16 @@ impl Bead {
         Bead {
             at: *at,
             contrast: 1.0,
+            image: 0.0,
             counts: true,
+            places: [place(at); 2],
             others: all[first..end].iter().filter(near).map(place).collect(),
         }
+    }
+
+    /// Its place for what a pixel says about its profile: the pixel had no part in finding it ([`crate::suggest`]).
+    pub(crate) fn place_for(&self, x_px: f64, y_px: f64) -> (f64, f64) {
+        self.places[colour(x_px, y_px)]
     }
 
     /// The pixels up to `reach_px` along row and column. Those that are nearer to another object are not among them.
@@ -93,14 +104,20 @@ impl Bead {
             let off_px2 = squared(u - x_px, v - y_px);
             let nearest = |(a, b): &(f64, f64)| squared(u - a, v - b) >= off_px2;
             let own = self.others.iter().all(nearest);
+            let (bead_x_px, bead_y_px) = self.place_for(u, v);
             own.then(|| OfBead {
                 x_px: u,
                 y_px: v,
-                r_px: off_px2.sqrt(),
+                r_px: f64::hypot(u - bead_x_px, v - bead_y_px),
                 grey: f64::from(flat.values[y * flat.width + x]),
             })
         }))
     }
+}
+
+/// Which colour a pixel has on a chessboard.
+pub(crate) fn colour(x_px: f64, y_px: f64) -> usize {
+    (x_px + y_px) as usize % 2
 }
 
 /// Fewest frames whose median shows the scene.

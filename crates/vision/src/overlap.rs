@@ -140,8 +140,8 @@ fn add(
         return;
     };
     let near_px2 = (3.0 * reach_px).powi(2);
-    let off_px2 = |b: &Bead, x: f64, y: f64| squared(b.at.x_px - x, b.at.y_px - y);
-    let near = |b: &&Bead| off_px2(b, bead.at.x_px, bead.at.y_px) < near_px2;
+    let off_px2 = |b: &Bead| squared(b.at.x_px - bead.at.x_px, b.at.y_px - bead.at.y_px);
+    let near = |b: &&Bead| off_px2(b) < near_px2;
     let near: Vec<&Bead> = frame.iter().filter(near).collect();
     let (prior_at, grey_at) = (knots - 1, knots);
     let mut parts = vec![0.0; knots + 1];
@@ -152,7 +152,8 @@ fn add(
         of.clear();
         parts.fill(0.0);
         for other in &near {
-            let r_px = off_px2(other, pixel.x_px, pixel.y_px).sqrt();
+            let (x_px, y_px) = other.place_for(pixel.x_px, pixel.y_px);
+            let r_px = f64::hypot(pixel.x_px - x_px, pixel.y_px - y_px);
             let bin = (r_px / prior.bin_px) as usize;
             if bin >= BINS {
                 continue;

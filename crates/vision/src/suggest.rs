@@ -5,6 +5,7 @@
 //! background, and those of the commonest size and contrast are taken as beads. The mean profile about their centres becomes the
 //! template: aligned, fitted, aligned again. Offline; allocates.
 
+mod apart;
 mod settings;
 
 use self::settings::{FADE, rounded, settings};
@@ -89,12 +90,21 @@ pub enum NothingToSuggest {
         /// Objects that were alike.
         objects: usize,
     },
+    /// The noise chooses the places of the objects, and so their profile.
+    #[error(
+        "{objects} objects are too faint for a profile: either half of their pixels puts them elsewhere, by more than their noise \
+         explains (more light, or a profile given by hand)"
+    )]
+    Faint {
+        /// Objects that were alike.
+        objects: usize,
+    },
 }
 
 /// Looks at frames of a recording, spread over it, and suggests settings for its beads.
 ///
 /// # Errors
-/// Nothing stands out, or what does is not alike, or not round.
+/// Nothing stands out, or what does is not alike, not round, or too faint.
 pub fn suggest(frames: &[Frame]) -> Result<Suggestion, NothingToSuggest> {
     found_in_scene(frames, |flats| suggest_in(frames, flats))
 }
@@ -289,6 +299,7 @@ fn learn(
     let mut template: Option<Template> = None;
     let mut fits: Vec<(usize, Fix)> = Vec::new();
     let mut filled = 1.0_f64;
+    let mut apart = None;
     for pass in 0..PASSES {
         let rings = collect(flats, &beads, template.as_ref(), least_px);
         let parametric = rings.parametric().ok_or(failed)?;
@@ -308,12 +319,19 @@ fn learn(
         let mut localiser = Localiser::new(settings.clone()).map_err(|_| failed)?;
         fits = fit(frames, &mut beads, &mut localiser);
         template = settings.template().ok();
+        if let Some(template) = &template {
+            let looks = (settings.polarity, reach_px);
+            apart = apart::place(flats, &mut beads, template, looks);
+        }
         snr = median(fits.iter().map(|(_, f)| f.snr));
         filled = localiser.filled();
         if fits.len() * 2 < objects && pass + 1 == PASSES {
             return Err(failed);
         }
         config = Some(settings);
+    }
+    if apart.is_some_and(|apart| apart > apart::MOST_APART) {
+        return Err(NothingToSuggest::Faint { objects });
     }
     let mut config = config.ok_or(failed)?;
     refused.bad_fit = objects - fits.len();
@@ -350,7 +368,7 @@ fn fit(frames: &[Frame], beads: &mut [Bead], localiser: &mut Localiser) -> Vec<(
     let mut fits = Vec::new();
     let mut found: Vec<Fix> = Vec::new();
     let near_px = localiser.template().radius_px();
-    beads.iter_mut().for_each(|bead| bead.contrast = 0.0);
+    beads.iter_mut().for_each(|bead| bead.image = 0.0);
     for beads in beads.chunk_by_mut(|a, b| a.at.frame == b.at.frame) {
         let Some(frame) = beads.first().and_then(|bead| frames.get(bead.at.frame)) else {
             continue;
@@ -366,7 +384,7 @@ fn fit(frames: &[Frame], beads: &mut [Bead], localiser: &mut Localiser) -> Vec<(
                 continue;
             };
             (at.x_px, at.y_px) = (fix.x_px, fix.y_px);
-            bead.contrast = fix.amplitude.abs();
+            bead.image = fix.amplitude;
             fits.push((at.frame, *fix));
         }
     }
@@ -378,11 +396,9 @@ fn fit(frames: &[Frame], beads: &mut [Bead], localiser: &mut Localiser) -> Vec<(
     };
     let enough = fits.len() >= FEWEST;
     for bead in beads.iter_mut() {
-        let is_fitted = bead.contrast > 0.0;
+        let is_fitted = bead.image != 0.0;
         bead.counts = is_fitted || !enough;
-        if !is_fitted {
-            bead.contrast = usual;
-        }
+        bead.contrast = if is_fitted { bead.image.abs() } else { usual };
     }
     fits
 }

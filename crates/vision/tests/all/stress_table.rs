@@ -323,7 +323,9 @@ fn the_whole_table_keeps_its_limits() {
     let names = |&(kind, snr, settings, spoil): &(usize, f64, Settings, Spoil)| {
         let name = format!("kind{kind} {snr} {settings:?} {spoil:?}");
         let alternatives = wanted.split(',');
-        let all = |words: &str| words.split_whitespace().all(|w| name.contains(w));
+        // From the start of a word: 5 is an SNR, not the end of "Blur(0.5)".
+        let any = |w: &str| name.split(' ').any(|part| part.starts_with(w));
+        let all = |words: &str| words.split_whitespace().all(any);
         alternatives.into_iter().any(all)
     };
     let rows = rows.filter(names).step_by(given("STRESS_EVERY", 1).max(1));
@@ -422,4 +424,25 @@ fn specks_beside_some_beads_widen_no_others() {
     let rows = [(4, 200.0, Settings::Right), (7, 40.0, Settings::Suggested)];
     let rows = rows.map(|(kind, snr, settings)| (kind, snr, settings, Spoil::Dust));
     run_with(&rows, 60.0, &(0.7..1.4));
+}
+
+#[test]
+fn noise_chooses_no_profile() {
+    // Parts of a ring that stand out of noise half as strong as it: aligned on maxima of the noise they showed a spike, and fixes made
+    // with it were off by up to twenty stated standard deviations. No profile is a right answer.
+    let (_, profile) = ring(6.4);
+    for seed in [7, 13] {
+        let mut random = Random(101 + 1_000_003 * seed);
+        let scene = Scene::new(profile.as_ref(), 10.0, Spoil::Noise(5.0), 7);
+        let pictures: Vec<Picture> = (0..LEARNT_FROM)
+            .map(|_| scene.picture(&mut random))
+            .collect();
+        let frames: Vec<Frame> = pictures.iter().map(Picture::frame).collect();
+        let Ok(found) = suggest(&frames) else {
+            continue;
+        };
+        let mut localiser = Localiser::new(found.config).unwrap();
+        let score = measured(&mut localiser, &scene, &mut random, 60.0);
+        assert!(score.lies <= 1e-3 * score.good, "{seed}: {score:?}");
+    }
 }
