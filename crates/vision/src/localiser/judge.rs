@@ -1,6 +1,7 @@
 //! The verdict on a fit, and the variance of its place.
 
 use super::certainty::LEAST_SIGNIFICANCE;
+use super::rise::Rise;
 use super::{Fitted, Localiser, NARROW_RADII};
 use crate::config::PixelNoise;
 use crate::fit::Weights;
@@ -30,16 +31,6 @@ const POOLED_FIXES: f64 = 4.0;
 const SPOILT: f64 = 0.01;
 /// Share of a bead's contrast in its window that the template must explain where the rest is the same all round.
 const LEAST_EXPLAINED: f64 = 0.5;
-
-/// Light that rises across the window.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Rise {
-    /// Along the row and along the column, grey levels a px.
-    pub slope: (f64, f64),
-    /// Squares of the ways by which fitting it has moved the place, times what it leaves over what it explains: the light of a speck
-    /// in a corner is drawn into a slope that does not go on under the bead.
-    pub way_px2: [f64; 2],
-}
 
 impl Localiser {
     /// The verdict of a fit, and its figures.

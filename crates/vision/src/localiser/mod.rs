@@ -6,6 +6,7 @@ mod certainty;
 mod judge;
 mod noise;
 mod refine;
+mod rise;
 mod together;
 mod view;
 
@@ -25,7 +26,7 @@ use crate::speckle;
 use crate::streak::{Comb, Way};
 use crate::template::Template;
 use alike::Alike;
-use judge::Rise;
+use rise::Rise;
 use view::View;
 
 /// A step below this ends the fit, px: what is left after it is of second order in it.

@@ -1,6 +1,7 @@
 //! The steps after the first fit: specks are left out, and rising light and another focus are fitted if the window asks for them.
 
-use super::judge::{Rise, WIDENED_RATIO};
+use super::judge::WIDENED_RATIO;
+use super::rise::Rise;
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
