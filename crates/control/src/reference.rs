@@ -177,8 +177,6 @@ fn move_um(
     }
 }
 
-impl Profile {}
-
 impl Reference for Profile {
     fn at_um(&self, time_s: f64) -> f64 {
         match self {

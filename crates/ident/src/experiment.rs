@@ -79,7 +79,12 @@ pub struct Turn {
     pub part: f64,
 }
 
-impl Turn {}
+impl Turn {
+    /// A segment as it is planned.
+    pub fn planned(index: usize) -> Self {
+        Self { index, part: 1.0 }
+    }
+}
 
 /// The expected plant and loop that amplitudes are shaped by, at one frequency: `X2/X1`, and plant times controller
 /// (0 in open loop).

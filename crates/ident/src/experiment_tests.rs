@@ -28,7 +28,7 @@ fn a_schedule_is_what_a_run_would_have_added_tick_by_tick() {
     let plan = Plan::stepped_sines(&[5.0, 20.0, 50.0], &integrator, limits, 1e-3, 10.0);
     let mut noted = Noting(Vec::new());
     let records = plan.run(&mut noted, 1, |_| {}).unwrap();
-    let schedule = plan.schedule(&[1, 2].map(|index| Turn { index, part: 1.0 }));
+    let schedule = plan.schedule(&[1, 2].map(Turn::planned));
     assert_eq!(schedule.excitation_um, noted.0);
     for (span, record) in schedule.spans.iter().zip(&records) {
         assert_eq!(

@@ -53,19 +53,13 @@ fn a_bead_found_again_is_caught_at_rest_and_the_next_segment_and_the_end_find_it
     let neutral_um = file.emulator.neutral_um;
     let rig = OnRig::new(file, Model::eq6(), None, Frames::Off, true).expect("an emulated rig");
     let plan = plan();
-    let spans = plan
-        .schedule(&[0, 1].map(|index| Turn { index, part: 1.0 }))
-        .spans;
+    let spans = plan.schedule(&[0, 1].map(Turn::planned)).spans;
     let mut listener = Listener {
         progress: &mut |_| {},
         segment: &mut |_| {},
     };
     let acquired = rig
-        .acquire(
-            &plan,
-            &[0, 1].map(|index| Turn { index, part: 1.0 }),
-            &mut listener,
-        )
+        .acquire(&plan, &[0, 1].map(Turn::planned), &mut listener)
         .expect("a run");
     let indices: Vec<usize> = acquired.records.iter().map(|record| record.index).collect();
     assert_eq!(indices, [1], "the first is spoilt, the second is whole");
