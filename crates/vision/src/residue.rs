@@ -69,6 +69,17 @@ impl Look {
     };
 }
 
+/// What the patches of a window say.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Widening {
+    /// By how much the variance of the position is larger.
+    pub by: f64,
+    /// The window's bends, besides those of the look if the bead was seen before.
+    pub bends: [f64; 2],
+    /// Whether it was.
+    pub is_known: bool,
+}
+
 /// The looks of the beads, and room to work.
 #[derive(Debug, Clone)]
 pub(crate) struct Residues {
@@ -81,9 +92,6 @@ pub(crate) struct Residues {
     /// Room for what the template leaves of a window, and its mean at whole distances from the bead, px.
     pub left: Box<[Row; MAX_WINDOW_PX]>,
     rings: Box<[f32; RINGS]>,
-    /// Bends of the window at hand over its contrast, and whether the bead's own are taken off: [`Residues::widening`] does.
-    pub bends: [f64; 2],
-    pub is_known: bool,
 }
 
 impl Residues {
@@ -95,8 +103,6 @@ impl Residues {
             pooled: [Scales::default(); 2],
             left: Box::new([[0.0; STRIDE]; MAX_WINDOW_PX]),
             rings: Box::new([0.0; RINGS]),
-            bends: [0.0; 2],
-            is_known: false,
         }
     }
 
@@ -112,8 +118,8 @@ impl Residues {
     }
 
     /// By how much the variance of the position is larger than from noise of the even `variance` (grey^2), judged by what
-    /// the template leaves of this window, besides the bead's look, and has left of the windows before. `None` for a window
-    /// with the bead far off its middle. Allocates nothing.
+    /// the template leaves of this window, besides the bead's look, and has left of the windows before. The same of its `bends`,
+    /// relative to the contrast. `None` for a window with the bead far off its middle. Allocates nothing.
     pub(crate) fn widening(
         &mut self,
         crop: &Crop,
@@ -121,8 +127,8 @@ impl Residues {
         comb: &Comb,
         at: (f64, f64),
         (amplitude, background): (f64, f64),
-        variance: f64,
-    ) -> Option<f64> {
+        (variance, mut bends): (f64, [f64; 2]),
+    ) -> Option<Widening> {
         let half = crop.width.max(crop.height) / 2;
         let (scores, inverse, freedom) =
             self.scores(crop, template, comb, at, (amplitude, background))?;
@@ -149,10 +155,9 @@ impl Residues {
                 relative * own * kept,
             )?);
         }
-        let (seen, look_bends) = (self.bends, look.bends);
-        self.is_known = !is_new;
+        let (seen, look_bends) = (bends, look.bends);
         if !is_new {
-            for (bend, mean) in self.bends.iter_mut().zip(look_bends) {
+            for (bend, mean) in bends.iter_mut().zip(look_bends) {
                 *bend = (*bend - mean) / own.sqrt();
             }
         }
@@ -171,7 +176,11 @@ impl Residues {
         }
         let now = now.max(LEAST_WIDENING);
         pool.take_in(now, freedom);
-        Some(pool.moderate(now, freedom))
+        Some(Widening {
+            by: pool.moderate(now, freedom),
+            bends,
+            is_known: !is_new,
+        })
     }
 
     /// The look of the bead at a place: the one of the nearest fix before, or a new one in place of that unused for longest.
@@ -449,8 +458,8 @@ mod tests {
         assert!(crop.take(&frame, AT.0, AT.1, SIDE));
         let parts = (400.0, 1000.0 - f64::from(crop.pedestal));
         residues.frames += u64::from(is_new);
-        let found = residues.widening(&crop, &template, &Comb::STILL, AT, parts, 1.0);
-        found.unwrap()
+        let found = residues.widening(&crop, &template, &Comb::STILL, AT, parts, (1.0, [0.0; 2]));
+        found.unwrap().by
     }
 
     #[test]

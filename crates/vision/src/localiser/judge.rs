@@ -254,21 +254,24 @@ impl Localiser {
         let variance = self.pixel_variance(fix.background);
         // In the noise that windows have in common: what is pooled would vary with that of each window.
         let common = self.noises.common().unwrap_or(variance);
-        self.residues.bends = left.bends(fix.amplitude);
-        let by_patches = self.residues.widening(
+        let bends = left.bends(fix.amplitude);
+        let seen = self.residues.widening(
             &self.crop,
             &self.template,
             &self.comb,
             at,
             (fix.amplitude, background),
-            common,
+            (common, bends),
         );
-        let by_patches = by_patches.map_or(fix.residual_ratio, |w| w * common / variance);
+        let (by_patches, bends, is_known) = match seen {
+            Some(seen) => (seen.by * common / variance, seen.bends, seen.is_known),
+            None => (fix.residual_ratio, bends, false),
+        };
         let mut by_patches = by_patches.max(1.0);
         if self.template.radius_px() >= UNRESOLVED_PX && self.comb.is_still() {
             let stated = by_patches * variance / (fix.amplitude * fix.amplitude);
-            let bends = self.residues.bends.map(|bend| bend * bend / stated);
-            by_patches *= self.alike.beyond(bends, self.residues.is_known);
+            let bends = bends.map(|bend| bend * bend / stated);
+            by_patches *= self.alike.beyond(bends, is_known);
         }
         let (local, answer) = self.residues.besides_the_mean(
             &self.crop,

@@ -5,8 +5,7 @@
 //! beads do not help, and two halves of the beads confirm it in each other (Henderson, PNAS 110, 18037, 2013, on pictures of
 //! particles in noise). So a pixel says nothing about the profile at a place that it has chosen. The pixels have the colours of a
 //! chessboard; those of each colour are taken at the places that fit those of the other colour best. Noise that is separate from
-//! pixel to pixel then shows nothing, and a bead's two places tell how
-//! large the error is.
+//! pixel to pixel then shows nothing, and a bead's two places tell how large the error is.
 
 use crate::config::Polarity;
 use crate::fix::squared;
@@ -59,7 +58,7 @@ pub(super) fn place(
             if bead.image != 0.0
                 && let (Some(va), Some(vb)) = (var_a_px2, var_b_px2)
             {
-                let explained_px2 = va + vb + squared(COARSE_PX, 0.0);
+                let explained_px2 = va + vb + COARSE_PX * COARSE_PX;
                 apart.push(squared(a.0 - b.0, a.1 - b.1) / explained_px2);
             }
         }
@@ -79,7 +78,7 @@ fn alone(
 ) -> Vec<Grey> {
     let at = &bead.at;
     let away_px2 = |other: &Bead| squared(other.at.x_px - at.x_px, other.at.y_px - at.y_px);
-    let near_px2 = squared(template.support_px() + 2.0 * reach_px, 0.0);
+    let near_px2 = (template.support_px() + 2.0 * reach_px).powi(2);
     let near = |other: &&Bead| other.image != 0.0 && (1e-6..near_px2).contains(&away_px2(other));
     let near: Vec<&Bead> = frame.iter().filter(near).collect();
     let pixels = bead.pixels(flats, reach_px).into_iter().flatten();
@@ -107,22 +106,22 @@ fn fitted(
     let grid = steps
         .filter(|(i, j)| i * i + j * j <= range * range)
         .map(|(i, j)| (start.0 + f64::from(i), start.1 + f64::from(j)));
-    let explained = |at: &(f64, f64)| Fitted::new(pixels, *at, template).explained(sign);
-    let best = grid
-        .map(|at| (at, explained(&at)))
-        .max_by(|a, b| a.1.total_cmp(&b.1));
-    let Some((mut at, mut most)) = best else {
+    let of = |at: (f64, f64)| {
+        let fitted = Fitted::new(pixels, at, template);
+        (at, fitted.explained(sign), fitted)
+    };
+    let best = grid.map(of).max_by(|a, b| a.1.total_cmp(&b.1));
+    let Some(mut best) = best else {
         return (start, None);
     };
     let mut share = 1.0;
     for _ in 0..STEPS {
-        let Some((dx, dy)) = Fitted::new(pixels, at, template).step() else {
+        let Some((dx, dy)) = best.2.step() else {
             break;
         };
-        let next = (at.0 + share * dx, at.1 + share * dy);
-        let more = explained(&next);
-        if more > most {
-            (at, most) = (next, more);
+        let next = of((best.0.0 + share * dx, best.0.1 + share * dy));
+        if next.1 > best.1 {
+            best = next;
         } else {
             share *= 0.5;
         }
@@ -130,7 +129,7 @@ fn fitted(
             break;
         }
     }
-    (at, Fitted::new(pixels, at, template).variance_px2())
+    (best.0, best.2.variance_px2())
 }
 
 /// Sums of products over the pixels of a template at a place, its derivatives by the place, and a level.
@@ -185,7 +184,7 @@ impl Fitted {
         let left = self.square - self.right.dot(&found);
         let noise = left / (self.normal[(0, 0)] - 4.0).max(1.0);
         let inverse = cholesky.inverse();
-        let variance = noise * (inverse[(2, 2)] + inverse[(3, 3)]) / squared(found[1], 0.0);
+        let variance = noise * (inverse[(2, 2)] + inverse[(3, 3)]) / (found[1] * found[1]);
         (variance.is_finite() && variance > 0.0).then_some(variance)
     }
 }
