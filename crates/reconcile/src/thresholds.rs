@@ -109,7 +109,7 @@ pub struct Thresholds {
     pub needed_rows_of_others: usize,
     /// Below this part of the motion a record does not go with the model in any sense.
     pub least_alike: f64,
-    /// Fewest missing or repeated frames that are a fault of the camera: fewer are a start-up glitch. Pinned by the counts of
+    /// Fewest gaps or repeated frames that are a fault of the camera: fewer are a start-up glitch or a stall. Pinned by the counts of
     /// the labelled cases, as are the others of frames.
     pub faults_least: usize,
     /// Smallest rate of missing or repeated frames that is reported.

@@ -9,6 +9,8 @@ use std::collections::BTreeMap;
 pub(crate) struct FrameCounts {
     pub rows: usize,
     pub missing: usize,
+    /// Runs of missing frames. A camera or a line that stalls once loses many frames in one run.
+    pub gaps: usize,
     pub pairs: usize,
     pub repeats: usize,
     /// Exact zero increments that the resolution of the file gives by chance.
@@ -35,11 +37,11 @@ impl FrameCounts {
         ((self.repeats as f64 - self.by_chance) / self.pairs.max(1) as f64).max(0.0)
     }
 
-    /// More missing frames than a start-up glitch.
+    /// More losses than a start-up glitch and a stall. The effect loses each frame by itself, so what counts is how often, not how many.
     pub(crate) fn drops_named(&self) -> bool {
         self.of_camera
-            && self.missing >= THRESHOLDS.faults_least
-            && self.drop_rate() > THRESHOLDS.faults_rate
+            && self.gaps >= THRESHOLDS.faults_least
+            && self.gaps as f64 > THRESHOLDS.faults_rate * self.rows as f64
     }
 
     /// Beyond chance by five standard deviations and by a half of what chance gives.
@@ -72,6 +74,7 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
     let mut c = FrameCounts {
         rows: 0,
         missing: 0,
+        gaps: 0,
         pairs: 0,
         repeats: 0,
         by_chance: 0.0,
@@ -93,9 +96,10 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
         ) {
             c.rows += last - first + 1;
             let unseen = |k: usize| r.unseen.get(k).is_some_and(|u| *u);
-            c.missing += (first..=last)
-                .filter(|&k| r.bead_um[k].is_nan() && !unseen(k))
-                .count();
+            let missing = |k: usize| r.bead_um[k].is_nan() && !unseen(k);
+            let lost = (first..=last).filter(|&k| missing(k));
+            c.missing += lost.clone().count();
+            c.gaps += lost.filter(|&k| !missing(k - 1)).count();
         }
         let mut repeated = vec![false; n];
         let steps = Steps::of(r);
@@ -238,6 +242,25 @@ mod tests {
         }
         let t: Vec<f64> = (0..rows).map(|k| k as f64 * 1e-3).collect();
         Record::from_rows("r", &t, &t, &y).unwrap()
+    }
+
+    #[test]
+    fn a_stall_that_loses_many_frames_at_once_is_no_rate_of_drops() {
+        let without = |lost: &dyn Fn(usize) -> bool| {
+            let mut r = walk(40_000, |_, _| false);
+            for (k, bead) in r.bead_um.iter_mut().enumerate() {
+                if lost(k) {
+                    *bead = f64::NAN;
+                }
+            }
+            count(&[r], true)
+        };
+        let stall = without(&|k| (18_000..18_040).contains(&k));
+        assert_eq!((stall.missing, stall.gaps), (40, 1));
+        assert!(!stall.drops_named());
+        assert!(without(&|k| k % 1000 == 500).drops_named());
+        // Many short bursts are a fault of the camera.
+        assert!(without(&|k| k % 2000 < 3).drops_named());
     }
 
     #[test]

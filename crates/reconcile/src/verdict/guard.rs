@@ -138,8 +138,10 @@ pub(crate) fn motion(ctx: &Context<'_>) -> Result<Option<String>, ReconcileError
         });
     }
     let excess = yy - count;
-    // Of another plant the noise may be the residual of a base that is far too poor.
-    if excess < 0.02 * count && ss > 0.5 * count && !problem.base.free_start {
+    // Of another plant the noise may be the residual of a base that is far too poor. A bubble or a slow wall takes the fast motion
+    // away, which is what innovations show; the slow motion then still goes with the command.
+    let still = excess < 0.02 * count && ss > 0.5 * count && !problem.base.free_start;
+    if still && level_likeness(problem, &sim, &delays).0 <= THRESHOLDS.least_alike {
         return Err(ReconcileError::AnotherRig {
             explained_percent: 0.0,
             detail: "; the bead hardly moves although the command does".to_owned(),

@@ -1,5 +1,6 @@
 //! The labelled records: made by a program of another make, with the hidden effect in the folder's name.
 
+use cellpos_numeric::Random;
 use cellpos_plant::Model;
 use cellpos_reconcile::{
     Options, ReconcileError, Reconciliation, Record, Verdict, reconcile, report,
@@ -186,5 +187,46 @@ fn wrong_units_constant_inputs_short_and_foreign_records_get_a_message() {
         matches!(run(&foreign), Err(ReconcileError::AnotherRig { .. })),
         "{:?}",
         run(&foreign).map(|r| r.verdict)
+    );
+}
+
+/// A bubble of 40 ms takes nearly all the fast motion away, which is what the innovations show. What is left goes with the command.
+#[test]
+fn a_bead_that_has_lost_its_fast_motion_is_not_of_another_rig() {
+    // The search for what the bubble is does not matter here.
+    let briefly = |records: &[Record]| {
+        let options = Options {
+            work: 0.002,
+            max_effects: 1,
+            ..Options::default()
+        };
+        reconcile(&Model::eq6(), records, &options, &mut |_| {})
+    };
+    let all = case("none-1");
+    let mut records = all[..2].to_vec();
+    for r in &mut records {
+        let share = r.sample_s / 0.04;
+        let mut slow = r.bead_um[0];
+        for b in &mut r.bead_um {
+            slow += share * (*b - slow);
+            *b = slow;
+        }
+    }
+    let result = briefly(&records);
+    assert!(
+        !matches!(result, Err(ReconcileError::AnotherRig { .. })),
+        "{result:?}"
+    );
+    let mut still = all;
+    for r in &mut still {
+        let mut noise = Random::new(3);
+        r.bead_um
+            .iter_mut()
+            .for_each(|b| *b = 0.02 * noise.normal());
+    }
+    let result = briefly(&still);
+    assert!(
+        matches!(result, Err(ReconcileError::AnotherRig { .. })),
+        "{result:?}"
     );
 }
