@@ -239,8 +239,13 @@ pub trait EffectKind: fmt::Debug + Send + Sync + AsEffectKind {
         Vec::new()
     }
 
-    /// The effect of candidate `index`, with these values of its parameters. By default they are the numbers of the form with that index,
-    /// or of the only form.
+    /// Keeps values of candidate `index` within what one of them allows another, such as the end of a range above its start.
+    fn bind(&self, index: usize, values: &mut [f64]) {
+        let _ = (index, values);
+    }
+
+    /// The effect of candidate `index`, with these values of its parameters, which [`Self::bind`] leaves as they are. By default they are
+    /// the numbers of the form with that index, or of the only form.
     fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect {
         let _ = scope;
         let form = if index < self.spec().forms.len() {

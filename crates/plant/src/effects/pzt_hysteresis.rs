@@ -290,13 +290,19 @@ impl EffectKind for PztHysteresis {
         }
     }
 
+    fn bind(&self, index: usize, values: &mut [f64]) {
+        if let (0 | 5, [_, beta, gamma]) = (index, values) {
+            *gamma = gamma.clamp(-*beta, *beta);
+        }
+    }
+
     fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect {
         let at = |i: usize| values.get(i).copied().unwrap_or(0.0);
         let thresholds = LEVELS.map(|l| l * scope.stroke_um);
         match index {
-            0 => bouc_wen(at(0), at(1), at(2).clamp(-at(1), at(1))),
+            0 => bouc_wen(at(0), at(1), at(2)),
             1 => exponential_play(at(0), at(1)),
-            5 => bouc_wen_explicit(at(0), at(1), at(2).clamp(-at(1), at(1))),
+            5 => bouc_wen_explicit(at(0), at(1), at(2)),
             2 | 4 => curved_play(
                 &thresholds,
                 &values[..LEVELS.len()],

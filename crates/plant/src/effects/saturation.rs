@@ -74,10 +74,16 @@ impl EffectKind for Saturation {
             .collect()
     }
 
+    fn bind(&self, index: usize, values: &mut [f64]) {
+        if let (0, [low, high]) = (index, values) {
+            *high = high.max(*low + 1e-3);
+        }
+    }
+
     fn build(&'static self, index: usize, values: &[f64], scope: &Scope) -> Effect {
         let low = values.first().copied().unwrap_or(0.0);
         let limits = match index {
-            0 => [low, values.get(1).copied().unwrap_or(low).max(low + 1e-3)],
+            0 => [low, values.get(1).copied().unwrap_or(low)],
             // The limit of a side that is not searched is beyond every command.
             1 => [(scope.low_um - 1.0).min(0.0).min(low - 1e-3), low],
             _ => [low, (scope.high_um + 1.0).max(40.0).max(low + 1e-3)],

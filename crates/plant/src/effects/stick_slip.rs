@@ -68,9 +68,10 @@ impl EffectKind for StickSlip {
         grid(&[12.0, 18.0, 27.0, 40.0, 60.0, 90.0], &[3.0, 10.0])
     }
 
-    fn build(&'static self, _: usize, values: &[f64], _: &Scope) -> Effect {
-        let v = |i: usize| values.get(i).copied().unwrap_or(0.0);
-        Effect::new(self, 0, &[v(0), v(1).min(v(0))], &[])
+    fn bind(&self, _: usize, values: &mut [f64]) {
+        if let [start, stop] = values {
+            *stop = stop.min(*start);
+        }
     }
 }
 

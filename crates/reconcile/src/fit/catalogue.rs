@@ -133,14 +133,17 @@ impl Part {
         self.variant.candidate()
     }
 
-    /// Parameter values in their units.
+    /// Parameter values in their units, within their bounds.
     pub(crate) fn natural(&self) -> Vec<f64> {
-        self.variant()
-            .params
-            .iter()
-            .zip(&self.theta)
-            .map(|(p, x)| p.natural(*x))
-            .collect()
+        let numbers = self.variant().params.iter().zip(&self.theta);
+        let mut values: Vec<f64> = numbers.map(|(p, x)| p.natural(*x)).collect();
+        self.variant.kind.bind(self.variant.form, &mut values);
+        values
+    }
+
+    /// Takes the fit's coordinates back within the bounds. Beyond them a number does nothing, and has no derivative to lead it back.
+    pub(crate) fn keep_within_bounds(&mut self) {
+        *self = Self::new(self.variant, &self.natural());
     }
 
     /// The delay of a slow motion by this effect, if it has one \[s\].

@@ -5,25 +5,23 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::fit::linear::{Tangents, normal_equations};
+use crate::fit::evaluate::State;
+use crate::fit::linear::{self, Tangents, normal_equations};
+use crate::fit::step::GAIN_RANGE;
 use crate::fit::waves;
 use crate::mask::Mask;
 use cellpos_plant::effects::Role;
-use nalgebra::{DMatrix, DVector};
-
-/// Precision with which a weight of a play operator keeps its value in one step of a fit. It is negligible if the operator moves
-/// in a record. It is no information: a weight that no record moves may have any value.
-const WEIGHT_PRECISION: f64 = 100.0;
+use nalgebra::DMatrix;
 
 /// A fit ends if a round gains less than this, or than this share of its excess over the noise.
 const STILL: f64 = 0.02;
 const STILL_SHARE: f64 = 3e-6;
 
-/// Largest free factor on the base model's gain.
-const GAIN_RANGE: f64 = 20.0;
-
 /// Rounds before a fit may be given up: the first ones find their damping.
 const FEWEST: usize = 4;
+
+/// Dampings that are tried with new derivatives.
+const FIRST_TRIALS: usize = 8;
 
 /// How far a fit is carried on.
 #[derive(Debug, Clone, Copy)]
@@ -165,76 +163,63 @@ impl Context<'_> {
     }
 
     /// Descends; the number `still`, if any, keeps its value.
+    ///
+    /// Derivatives cost a simulation for each number. So they are taken again only where the steps of the last ones no longer help: in
+    /// between, each step corrects them (Broyden 1965).
     fn run(&self, mut fit: Fit, mask: &Mask, until: Until, still: Option<usize>) -> Fit {
         fit.count = self.problem.count(mask);
         let mut state = self.state(&fit, mask);
         let mut lambda = 1e-3;
-        let mut size;
         let mut normal;
         let mut round = 0;
         let mut gained = 0.0;
         loop {
-            let (n, columns) = self.columns(&fit, &state, mask);
-            size = n;
-            let (a, mut g) = normal_equations(n, &columns, &state.innovations, mask);
-            normal = a;
-            // Operators wider than any swing of the records never move: their weights keep their values.
-            let mut held = normal.clone();
-            let mut at = 0;
-            for p in &fit.parts {
-                for (j, q) in p.variant().params.iter().enumerate() {
-                    if q.name == "weights" {
-                        held[(at + j, at + j)] += WEIGHT_PRECISION;
-                    }
-                }
-                at += freedom_of(p.variant(), self.problem.records.len());
-            }
-            if let Some(still) = still {
-                held.row_mut(still).fill(0.0);
-                held.column_mut(still).fill(0.0);
-                g[still] = 0.0;
-            }
+            let (n, mut columns) = self.columns(&fit, &state, mask);
+            let mut linear = self.linear(&fit, &state, (n, &columns), mask, still);
+            normal = linear.normal.clone();
             if round >= until.iterations {
                 break;
             }
             round += 1;
-            let mut improved = 0.0;
-            for _ in 0..8 {
-                let mut damped = held.clone();
-                for i in 0..n {
-                    damped[(i, i)] +=
-                        lambda * held[(i, i)] + 1e-12 + if held[(i, i)] == 0.0 { 1.0 } else { 0.0 };
-                }
-                let Some(step) = damped.cholesky().map(|c| c.solve(&(-&g))) else {
-                    lambda *= 10.0;
-                    continue;
+            let count = fit.count as f64;
+            let least = |state: &State| {
+                let rough = (state.chi2 - count).max(0.0);
+                STILL.max(STILL_SHARE * rough)
+            };
+            let before = state.chi2;
+            let mut trials = FIRST_TRIALS;
+            for _ in 0..=self.simulations_of_columns(&fit) {
+                let Some((next, next_state)) =
+                    self.step_down((&fit, &state), &linear, &mut lambda, trials, mask)
+                else {
+                    break;
                 };
-                let trial = self.stepped(&fit, &step);
-                let trial_state = self.state(&trial, mask);
-                if trial_state.chi2 < state.chi2 {
-                    improved = state.chi2 - trial_state.chi2;
-                    fit = trial;
-                    state = trial_state;
-                    lambda = (lambda * 0.2).max(1e-9);
+                let improved = state.chi2 - next_state.chi2;
+                let moved = self.numbers(&next) - self.numbers(&fit);
+                linear::correct(
+                    &mut columns,
+                    &moved,
+                    &linear.normal,
+                    [&state.innovations, &next_state.innovations],
+                );
+                (fit, state) = (next, next_state);
+                if improved < least(&state) {
                     break;
                 }
-                // A step that changes next to nothing: converged.
-                if trial_state.chi2 - state.chi2 < 1e-3 {
-                    break;
-                }
-                lambda = (lambda * 8.0).max(1e-6);
+                linear = self.linear(&fit, &state, (n, &columns), mask, still);
+                trials = 1;
             }
-            gained = improved;
-            let rough = (state.chi2 - fit.count as f64).max(0.0);
-            if improved < STILL.max(STILL_SHARE * rough) {
+            gained = before - state.chi2;
+            if gained < least(&state) {
                 break;
             }
             // The steps of a descent become smaller. Even with steps as large as this one, the remaining ones would not suffice.
-            let most = improved * (until.iterations - round) as f64;
+            let most = gained * (until.iterations - round) as f64;
             if round >= FEWEST && state.chi2 - most > until.least_chi2 {
                 break;
             }
         }
+        let size = normal.nrows();
         let inverse = covariance(&normal);
         fit.last_gain = gained;
         fit.innovations = if mask.iter().any(Vec::is_empty) {
@@ -254,59 +239,13 @@ impl Context<'_> {
         fit
     }
 
-    fn stepped(&self, fit: &Fit, step: &DVector<f64>) -> Fit {
-        let mut t = fit.clone();
-        let records = self.problem.records.len();
-        let mut next = 0;
-        let (mut line, mut position) = (0, 0);
-        for part in &mut t.parts {
-            let v = part.variant();
-            match v.role {
-                Role::Chain => {
-                    for (x, p) in part.theta.iter_mut().zip(v.params) {
-                        // A logarithm that wants to move more than a factor of four is not in its linear range.
-                        let d = if p.log {
-                            step[next].clamp(-1.4, 1.4)
-                        } else {
-                            step[next]
-                        };
-                        *x = p.coordinate(p.natural(*x + d));
-                        next += 1;
-                    }
-                }
-                Role::Line { harmonics } => {
-                    let p = &v.params[0];
-                    part.theta[0] =
-                        p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.05, 0.05)));
-                    let waves = t.lines[line].iter_mut().flatten().flatten();
-                    for (x, step) in waves.zip(step.iter().skip(next + 1)) {
-                        *x += step;
-                    }
-                    next += 1 + 2 * harmonics * records;
-                    line += 1;
-                }
-                Role::Position => {
-                    let p = &v.params[0];
-                    part.theta[0] =
-                        p.coordinate(p.natural(part.theta[0] + step[next].clamp(-0.02, 0.02)));
-                    t.positions[position][0] += step[next + 1];
-                    t.positions[position][1] += step[next + 2];
-                    next += 3;
-                    position += 1;
-                }
-            }
-        }
-        if self.has_free_offset(&fit.parts) {
-            // The rig rested somewhere within its commands.
-            let most_um = self.scope.stroke_um;
-            t.offset_um = (t.offset_um + step[next]).clamp(-most_um, most_um);
-            next += 1;
-        }
-        t.soft = (t.soft + step[next]).clamp(self.problem.soft.0, self.problem.soft.1);
-        if self.free_gain {
-            t.gain = (t.gain + step[next + 1]).clamp(0.05, GAIN_RANGE);
-        }
-        t
+    /// Simulations that the derivatives at a fit cost.
+    fn simulations_of_columns(&self, fit: &Fit) -> usize {
+        let chain = fit.parts.iter().map(Part::variant);
+        let numbers: usize = (chain.filter(|v| v.role == Role::Chain))
+            .map(|v| v.params.len())
+            .sum();
+        numbers + usize::from(self.has_free_offset(&fit.parts))
     }
 
     /// The rows and columns of the parts' own parameters.

@@ -274,10 +274,14 @@ impl Context<'_> {
             } else {
                 (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0)
             };
-        if (if p.log { (x + step).exp() } else { x + step }) > p.upper {
-            step = -step;
-        }
         parts[index].theta[j] = x + step;
+        // Another of the numbers may be its bound.
+        let mut within = parts[index].clone();
+        within.keep_within_bounds();
+        if (within.theta[j] - x) * step < (1.0 - 1e-6) * step * step {
+            step = -step;
+            parts[index].theta[j] = x + step;
+        }
         (parts, step)
     }
 }

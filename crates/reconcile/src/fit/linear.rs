@@ -99,3 +99,57 @@ pub(crate) fn normal_equations(
     }
     (a, g)
 }
+
+/// Corrects derivatives after a step so that they give the change of the innovations which it made (Broyden's update, in the metric of the
+/// normal matrix's diagonal, in which it does not matter in what unit a number is).
+pub(crate) fn correct(
+    columns: &mut [Columns],
+    moved: &DVector<f64>,
+    normal: &DMatrix<f64>,
+    [before, after]: [&[Vec<f64>]; 2],
+) {
+    for ((columns, before), after) in columns.iter_mut().zip(before).zip(after) {
+        let weight = |j: usize| normal[(j, j)] * moved[j];
+        let size: f64 = columns.iter().map(|(j, _)| weight(*j) * moved[*j]).sum();
+        if size <= 0.0 {
+            continue;
+        }
+        let mut unlike: Vec<f64> = after.iter().zip(before).map(|(a, b)| a - b).collect();
+        for (j, column) in columns.iter() {
+            for (e, c) in unlike.iter_mut().zip(column) {
+                *e -= moved[*j] * c;
+            }
+        }
+        for (j, column) in columns {
+            let share = weight(*j) / size;
+            for (c, e) in column.iter_mut().zip(&unlike) {
+                *c += share * e;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn corrected_derivatives_give_the_change_that_was_seen_and_keep_what_was_not_asked() {
+        let mut columns = vec![vec![(0, vec![1.0, 0.0, 2.0]), (1, vec![0.0, 3.0, 1.0])]];
+        let moved = DVector::from_vec(vec![0.5, -0.25]);
+        let normal = DMatrix::from_diagonal(&DVector::from_vec(vec![4.0, 100.0]));
+        let before = [vec![0.1, 0.2, 0.3]];
+        let after = [vec![0.9, -0.7, 1.2]];
+        correct(&mut columns, &moved, &normal, [&before, &after]);
+        let at = |columns: &[Columns], k: usize, by: [f64; 2]| {
+            columns[0][0].1[k] * by[0] + columns[0][1].1[k] * by[1]
+        };
+        for k in 0..3 {
+            let change = at(&columns, k, [0.5, -0.25]);
+            assert!((change - (after[0][k] - before[0][k])).abs() < 1e-12);
+        }
+        // Across the step, in the metric, nothing was learnt: 4 * 0.5 * x + 100 * -0.25 * y = 0 for (x, y) = (12.5, 1).
+        assert!((at(&columns, 0, [12.5, 1.0]) - 12.5).abs() < 1e-12);
+        assert!((at(&columns, 1, [12.5, 1.0]) - 3.0).abs() < 1e-12);
+    }
+}

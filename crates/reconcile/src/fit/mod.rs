@@ -9,4 +9,5 @@ mod evaluate;
 pub(crate) mod linear;
 pub(crate) mod locking;
 mod position_error;
+mod step;
 mod waves;

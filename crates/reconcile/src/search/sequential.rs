@@ -313,6 +313,27 @@ fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(
     Some((best, singles.take(2).collect()))
 }
 
+/// The best set with one more effect than a set; `None` if none is worth it. `least` is the least gain that it must promise, `forms` the
+/// sum of squares before the forms of the set.
+fn larger(
+    (ctx, mask, effort): (&Context<'_>, &Mask, Effort),
+    fit: &Fit,
+    beam: &mut Vec<Fit>,
+    (least, forms): (f64, f64),
+) -> Option<Fit> {
+    let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
+    next.retain(|f| worth_it(fit, f, forms));
+    let top_chi2 = next.first()?.chi2;
+    // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
+    for other in std::mem::take(beam) {
+        let least = 0.5 * (other.chi2 - top_chi2);
+        let limits = [least, f64::INFINITY];
+        next.extend(extensions(ctx, &other, mask, effort, 4, &[], limits));
+    }
+    let cost = |f: &Fit| penalised_cost(ctx, f);
+    next.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b)))
+}
+
 /// The model alone.
 fn without_effects(ctx: &Context<'_>, mask: &Mask) -> Fit {
     let mut null = ctx.fit(Vec::new(), mask, 6);
@@ -350,11 +371,13 @@ pub(crate) fn search(
         };
     };
     steps.push((ids(&fit), fit.chi2));
-    // The residual of a simple form must not get a name before the richer form was tried.
-    let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, much_left(&fit));
-    if reparametrised.parts != fit.parts {
-        fit = reparametrised;
-        steps.push((ids(&fit), fit.chi2));
+    // The residual of a simple form must not get a name before the richer form was tried. A set that has to beat another has its forms.
+    if effort.to_beat == f64::INFINITY {
+        let reparametrised = reparametrise(ctx, fit.clone(), mask, effort, much_left(&fit));
+        if reparametrised.parts != fit.parts {
+            fit = reparametrised;
+            steps.push((ids(&fit), fit.chi2));
+        }
     }
     // The last set whose effects were weighed against their rivals.
     let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
@@ -370,26 +393,21 @@ pub(crate) fn search(
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
         let forms = before_forms(ctx, &null, &fit, mask);
         let least = THRESHOLDS.addition_share * (forms - fit.chi2);
-        let mut next: Vec<Fit> =
-            extensions(ctx, &fit, mask, effort, 6, &[], [least, f64::INFINITY]);
-        next.retain(|f| worth_it(&fit, f, forms));
-        if next.is_empty() {
-            break;
-        }
-        // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
-        let top_chi2 = next[0].chi2;
-        for other in std::mem::take(&mut beam) {
-            let least = 0.5 * (other.chi2 - top_chi2);
-            let limits = [least, f64::INFINITY];
-            next.extend(extensions(ctx, &other, mask, effort, 4, &[], limits));
-        }
-        next.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
-        let Some(top) = next.first().cloned() else {
+        let Some(top) = larger((ctx, mask, effort), &fit, &mut beam, (least, forms)) else {
             break;
         };
         let top = eliminate(ctx, top, &null, mask, effort);
         if penalised_cost(ctx, &top) >= penalised_cost(ctx, &fit) {
             break;
+        }
+        if effort.is_beaten(&top, fit.chi2 - top.chi2) {
+            return Found {
+                rivals: vec![Vec::new(); fit.parts.len()],
+                fit,
+                null,
+                steps,
+                cut_short: true,
+            };
         }
         // A richer form of a present effect may explain as much as the next name.
         if top.parts.len() > fit.parts.len() {

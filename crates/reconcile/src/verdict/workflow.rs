@@ -161,6 +161,7 @@ fn within(
             options.max_effects.min(1)
         },
         work: (options.work * WORK) as u64,
+        to_beat: f64::INFINITY,
     };
     let (searched, by_chance) = searching.beside_chance(problem, &floor, effort, &mut *progress);
     let Searched { mut found, problem } = searched;
