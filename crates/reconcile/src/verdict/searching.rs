@@ -258,9 +258,7 @@ impl Searching<'_> {
     /// Searches under the noise of the rig: a zero flow that moves, or, if that is more probable, one that stands still.
     ///
     /// In a closed loop a zero flow and a slow effect of the response explain much the same motion, and the zero flow is always
-    /// there. So the search begins with one. Each set gives another estimate of it, until that settles. The largest effect gives the
-    /// first: what the others leave makes that too large rather than too small, and a zero flow that is too small in the noise would
-    /// call for effects in its stead.
+    /// there. So the search begins with one. Each set gives another estimate of it, until that settles.
     pub(super) fn under_noise(
         &self,
         problem: Problem,
@@ -276,20 +274,7 @@ impl Searching<'_> {
         }
         let median = prior_of(&problem).median(&problem.noise);
         let beside = problem.clone().with_noise(median);
-        let largest = Effort {
-            max_effects: effort.max_effects.min(1),
-            ..effort
-        };
-        let mut moving = self.search(beside, floor, largest, None, &mut *progress);
-        if !moving.found.cut_short {
-            let Weighed { problem, fit, cost } =
-                self.with_zero_flow(&moving.problem, &moving.found.fit);
-            let (problem, start) = match cost < self.cost(&moving.problem, &moving.found.fit) {
-                true => (problem, fit),
-                false => (moving.problem, moving.found.fit),
-            };
-            moving = self.search(problem, floor, effort, Some(start), &mut *progress);
-        }
+        let mut moving = self.search(beside, floor, effort, None, &mut *progress);
         // The first set was found with the errors of the model as they show without it, and part of it may stand for the difference.
         if problem.has_errors() && !moving.found.cut_short && !moving.found.fit.parts.is_empty() {
             progress("once more with the model's stated error beside the set");
