@@ -98,25 +98,44 @@ impl Localiser {
         let Some((x_px, y_px, pass, slope)) = found else {
             return Some(f);
         };
-        // What chance leaves says nothing of the light's shape.
-        let explained = f.pass.chi2 - pass.chi2;
-        let chance = LEAST_EXCESS * (2.0 * pixels).sqrt() * self.weight_unit();
-        let doubt = ((misfit - explained - chance) / explained).max(0.0);
         let rise = Rise {
             slope,
-            way_px2: [x_px - f.x_px, y_px - f.y_px].map(|way| doubt * way * way),
+            way_px2: [0.0; 2],
         };
-        let found = Fitted {
+        let mut found = Fitted {
             x_px,
             y_px,
             pass,
             rise,
             ..f
         };
+        if asked.slopes {
+            let doubt = self.doubt(&found, f.pass.chi2 - found.pass.chi2);
+            found.rise.way_px2 = [x_px - f.x_px, y_px - f.y_px].map(|way| doubt * way * way);
+        }
         Some(Fitted {
             left: self.left_by(&found),
             ..found
         })
+    }
+
+    /// What a fit of rising light leaves, over what it has explained: the light's shape is known to that part. What is the same all round
+    /// is the bead's, not the light's, and chance says nothing either.
+    fn doubt(&mut self, f: &Fitted, explained: f64) -> f64 {
+        let at = (f.x_px, f.y_px);
+        let parts = (f.pass.amplitude, f.pass.background);
+        let left = self
+            .residues
+            .lopsided(&self.crop, &self.template, &self.comb, at, parts);
+        let noise = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        let beyond = (left / noise - 1.0) * pixels - LEAST_EXCESS * (2.0 * pixels).sqrt();
+        let explained = explained / self.weight_unit();
+        if explained > 0.0 {
+            beyond.max(0.0) / explained
+        } else {
+            0.0
+        }
     }
 
     /// The fit without the light of specks beside the bead, if what is left then is noise. Else the window is as it was: a wall or a
