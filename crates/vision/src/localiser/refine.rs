@@ -5,7 +5,7 @@ use super::rise::Rise;
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
-use crate::dust::{self, Speck};
+use crate::dust::{self, Bill, Speck};
 use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
@@ -13,8 +13,6 @@ use crate::speckle;
 /// How often specks are searched in the residual of a fit: each time those at least half as strong as the strongest are left out.
 const MOST_LOOKS_FOR_SPECKS: usize = 5;
 
-/// Most specks beside a bead that are fitted.
-const MOST_SPECKS: usize = 2;
 /// Standard deviations of the sum of squares from which specks beside the bead are looked for.
 const LEAST_EXCESS: f64 = 3.0;
 /// Least share of a fit's excess residual that offsets of the lines must explain to count.
@@ -139,20 +137,28 @@ impl Localiser {
     }
 
     /// The fit without the light of specks beside the bead, if what is left then is noise. Else the window is as it was: a wall or a
-    /// third speck is not explained by an ellipse, and bends it.
+    /// third speck is not explained by an ellipse, and bends it. One of two specks may not pay its price while the light of the other
+    /// is left: then the two pay together.
     fn without_specks(&mut self, first: Fitted, side_px: usize) -> Fitted {
-        let mut specks = [None; MOST_SPECKS];
-        let mut last = None;
-        for slot in &mut specks {
-            let Some((found, speck)) = self.with_speck(last.as_ref().unwrap_or(&first)) else {
-                break;
-            };
-            (last, *slot) = (Some(found), Some(speck));
-        }
-        let Some(last) = last else {
+        let Some((one, speck, bill)) = self.with_speck(&first) else {
             return first;
         };
-        if self.leaves_noise(&last) {
+        let is_paid =
+            |this: &Self, bill: &Bill| bill.is_paid(&this.crop, this.template.radius_px());
+        let pays = is_paid(self, &bill);
+        let second = self.with_speck(&one);
+        let mut last = pays.then_some(one);
+        let mut specks = [Some(speck), None];
+        if let Some((two, other, own)) = second {
+            if is_paid(self, &if pays { own } else { bill.and(&own) }) {
+                (last, specks[1]) = (Some(two), Some(other));
+            } else {
+                other.put_back(&mut self.crop);
+            }
+        }
+        if let Some(last) = last
+            && self.leaves_noise(&last)
+        {
             if side_px == self.config.window_px {
                 self.read_noise_beside(&last);
             }
@@ -164,8 +170,8 @@ impl Localiser {
         first
     }
 
-    /// The fit of a bead together with a speck beside it, whose light is taken off the window, if a speck explains more than its price.
-    fn with_speck(&mut self, f: &Fitted) -> Option<(Fitted, Speck)> {
+    /// The fit of a bead together with a speck beside it, whose light is taken off the window, and what the speck explains.
+    fn with_speck(&mut self, f: &Fitted) -> Option<(Fitted, Speck, Bill)> {
         let variance = self.least_variance(f);
         let own = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
         let unit = self.weight_unit() * variance / own;
@@ -185,17 +191,17 @@ impl Localiser {
         let weights = self.weights(Some(&f.pass));
         let at = (f.x_px, f.y_px);
         let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
-        let other = f.left.explained_by_slope_and_size() / variance;
-        let gain = before - both.pass.chi2 / unit;
         both.speck.take_off(&mut self.crop);
         let parts = (both.pass.amplitude, both.pass.background);
         let left =
             self.residues
                 .lopsided(&self.crop, &self.template, &self.comb, both.place_px, parts);
-        if !dust::pays(&self.crop, radius_px, gain, left / variance, other) {
-            both.speck.put_back(&mut self.crop);
-            return None;
-        }
+        let bill = Bill {
+            specks: 1,
+            gain: before - both.pass.chi2 / unit,
+            lopsided: left / variance,
+            other: f.left.explained_by_slope_and_size() / variance,
+        };
         let (x_px, y_px) = both.place_px;
         let found = Fitted {
             x_px,
@@ -206,7 +212,7 @@ impl Localiser {
             left: f.left,
         };
         let left = self.left_by(&found);
-        Some((Fitted { left, ..found }, both.speck))
+        Some((Fitted { left, ..found }, both.speck, bill))
     }
 
     /// Whether what a fit leaves is noise, besides its mean all round.
