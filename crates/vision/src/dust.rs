@@ -116,6 +116,17 @@ impl Speck {
         })
     }
 
+    /// As large, and as wide as it is long.
+    pub(crate) fn rounded(&self) -> Self {
+        let width = (self.a * self.c).sqrt();
+        Speck {
+            a: width,
+            b: 0.0,
+            c: width,
+            ..*self
+        }
+    }
+
     /// Standard deviation along the shortest axis, px.
     fn shortest_px(&self) -> f64 {
         let (p, q) = (self.a * self.a, self.a * self.b);

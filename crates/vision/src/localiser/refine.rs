@@ -5,7 +5,7 @@ use super::rise::Rise;
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
-use crate::dust::{self, Bill, Speck};
+use crate::dust::{self, Bill, Both, Speck};
 use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
@@ -178,7 +178,8 @@ impl Localiser {
         let pixels = (self.crop.width * self.crop.height) as f64;
         let before = f.pass.chi2 / unit;
         // What chance leaves moves the bead by less than its own noise.
-        if before < pixels + LEAST_EXCESS * (2.0 * pixels).sqrt() {
+        let chance = pixels + LEAST_EXCESS * (2.0 * pixels).sqrt();
+        if before < chance {
             return None;
         }
         let place = (f.x_px - self.crop.x0 as f64, f.y_px - self.crop.y0 as f64);
@@ -190,7 +191,15 @@ impl Localiser {
         let first = Speck::seen(&self.crop, left, place, radius_px, noise)?;
         let weights = self.weights(Some(&f.pass));
         let at = (f.x_px, f.y_px);
-        let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
+        let fit = |speck| dust::fit(&self.crop, &self.template, at, speck, weights);
+        let mut both = fit(first);
+        if both.as_ref().is_none_or(|b| b.pass.chi2 / unit > chance) {
+            // A speck whose end is seen at the bead looks as wide as the bead's edge: a fit from there may end as a line along the edge.
+            let other = fit(first.rounded());
+            let is_better = |o: &Both| both.as_ref().is_none_or(|b| o.pass.chi2 < b.pass.chi2);
+            both = other.filter(is_better).or(both);
+        }
+        let both = both?;
         both.speck.take_off(&mut self.crop);
         let parts = (both.pass.amplitude, both.pass.background);
         let left =
