@@ -6,6 +6,7 @@ use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
 use crate::dust::{self, Bill, Both, Speck};
+use crate::fit::Pass;
 use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
@@ -147,9 +148,16 @@ impl Localiser {
             |this: &Self, bill: &Bill| bill.is_paid(&this.crop, this.template.radius_px());
         let pays = is_paid(self, &bill);
         let second = self.with_speck(&one);
+        // For a contrast of 1.
+        let covariance = |pass: &Pass| pass.covariance * (pass.amplitude * pass.amplitude);
+        let by_first = covariance(&one.pass) - covariance(&first.pass);
         let mut last = pays.then_some(one);
         let mut specks = [Some(speck), None];
-        if let Some((two, other, own)) = second {
+        if let Some((mut two, other, own)) = second {
+            // The first one's light is as uncertain as before: the last fit has taken it for known.
+            if by_first.diagonal().min() > 0.0 {
+                two.pass.covariance += by_first / (two.pass.amplitude * two.pass.amplitude);
+            }
             if is_paid(self, &if pays { own } else { bill.and(&own) }) {
                 (last, specks[1]) = (Some(two), Some(other));
             } else {
