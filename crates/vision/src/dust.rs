@@ -69,10 +69,11 @@ impl Speck {
         };
         let inside = |len: usize| 1..len.saturating_sub(1);
         let apart = APART_RADII * radius_px;
+        let is_apart = |j: usize, i: usize| squared(i as f64 - x, j as f64 - y) > apart * apart;
         let (mut peak, mut at) = (LEAST_PEAK * 3.0 * noise, None);
         for (j, i) in inside(crop.height).flat_map(|j| inside(crop.width).map(move |i| (j, i))) {
             let value = sum(j, i);
-            if value.abs() > peak && squared(i as f64 - x, j as f64 - y) > apart * apart {
+            if value.abs() > peak && is_apart(j, i) {
                 (peak, at) = (value.abs(), Some((j, i, value.signum())));
             }
         }
@@ -87,7 +88,8 @@ impl Speck {
         for (j, i) in
             about(j0, crop.height).flat_map(|j| about(i0, crop.width).map(move |i| (j, i)))
         {
-            if sign * sum(j, i) > 0.5 * peak {
+            // What is left at the bead's edge is the fit's, which the speck has drawn off.
+            if sign * sum(j, i) > 0.5 * peak && is_apart(j, i) {
                 let (dx, dy) = (i as f32 - i0 as f32, j as f32 - j0 as f32);
                 (n, sx, sy) = (n + 1.0, sx + dx, sy + dy);
                 (xx, xy, yy) = (xx + dx * dx, xy + dx * dy, yy + dy * dy);
@@ -112,6 +114,17 @@ impl Speck {
             c: yy.sqrt().recip(),
             contrast: 0.0,
         })
+    }
+
+    /// As large, and as wide as it is long.
+    pub(crate) fn rounded(&self) -> Self {
+        let width = (self.a * self.c).sqrt();
+        Speck {
+            a: width,
+            b: 0.0,
+            c: width,
+            ..*self
+        }
     }
 
     /// Standard deviation along the shortest axis, px.
@@ -383,13 +396,37 @@ pub(crate) fn alike_px(radius_px: f64) -> f64 {
     (core::f64::consts::PI * 0.25 * radius_px * radius_px).max(1.0)
 }
 
-/// Whether a speck explains enough: what it takes off the sum of squares (`gain`, variances of noise) beyond the price
-/// of its parameters, that is their number times the logarithm of the number of pixels (Schwarz 1978), and beyond what `other`
-/// parameters would take off. What the fit leaves beyond noise besides its mean all round (`lopsided`, variances of noise a pixel) is a
-/// template's error, alike over patches of half a bead radius: there a patch counts as one pixel. The mean all round is no speck's.
-pub(crate) fn pays(crop: &Crop, radius_px: f64, gain: f64, lopsided: f64, other: f64) -> bool {
-    let pixels = (crop.width * crop.height) as f64;
-    let excess = (lopsided - 1.0).max(0.0);
-    let price = OWN as f64 * pixels.ln() * (1.0 + alike_px(radius_px) * excess);
-    gain > price + other
+/// What specks explain, for the price of their parameters.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Bill {
+    pub specks: usize,
+    /// What they take off the sum of squares, variances of noise.
+    pub gain: f64,
+    /// What the fit leaves besides its mean all round, variances of noise a pixel.
+    pub lopsided: f64,
+    /// What other parameters would take off the sum of squares, variances of noise.
+    pub other: f64,
+}
+
+impl Bill {
+    /// That of these specks and one more, whose bill begins with what these leave.
+    pub(crate) fn and(&self, next: &Bill) -> Self {
+        Bill {
+            specks: self.specks + next.specks,
+            gain: self.gain + next.gain,
+            lopsided: next.lopsided,
+            other: self.other,
+        }
+    }
+
+    /// Whether they explain enough: more than the price of their parameters, that is their number times the logarithm of the number
+    /// of pixels (Schwarz 1978), and than others would. What the fit leaves beyond noise besides its mean all round is a template's
+    /// error, alike over patches of half a bead radius: there a patch counts as one pixel. The mean all round is no speck's.
+    pub(crate) fn is_paid(&self, crop: &Crop, radius_px: f64) -> bool {
+        let pixels = (crop.width * crop.height) as f64;
+        let excess = (self.lopsided - 1.0).max(0.0);
+        let parameters = (self.specks * OWN) as f64;
+        let price = parameters * pixels.ln() * (1.0 + alike_px(radius_px) * excess);
+        self.gain > price + self.other
+    }
 }

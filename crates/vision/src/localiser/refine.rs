@@ -5,7 +5,8 @@ use super::rise::Rise;
 use super::view::View;
 use super::{Fitted, Localiser, MAX_RECENTRES};
 use crate::beyond;
-use crate::dust::{self, Speck};
+use crate::dust::{self, Bill, Both, Speck};
+use crate::fit::Pass;
 use crate::fix::Fix;
 use crate::left::{self, Left};
 use crate::speckle;
@@ -13,8 +14,6 @@ use crate::speckle;
 /// How often specks are searched in the residual of a fit: each time those at least half as strong as the strongest are left out.
 const MOST_LOOKS_FOR_SPECKS: usize = 5;
 
-/// Most specks beside a bead that are fitted.
-const MOST_SPECKS: usize = 2;
 /// Standard deviations of the sum of squares from which specks beside the bead are looked for.
 const LEAST_EXCESS: f64 = 3.0;
 /// Least share of a fit's excess residual that offsets of the lines must explain to count.
@@ -98,42 +97,76 @@ impl Localiser {
         let Some((x_px, y_px, pass, slope)) = found else {
             return Some(f);
         };
-        // What chance leaves says nothing of the light's shape.
-        let explained = f.pass.chi2 - pass.chi2;
-        let chance = LEAST_EXCESS * (2.0 * pixels).sqrt() * self.weight_unit();
-        let doubt = ((misfit - explained - chance) / explained).max(0.0);
         let rise = Rise {
             slope,
-            way_px2: [x_px - f.x_px, y_px - f.y_px].map(|way| doubt * way * way),
+            way_px2: [0.0; 2],
         };
-        let found = Fitted {
+        let mut found = Fitted {
             x_px,
             y_px,
             pass,
             rise,
             ..f
         };
+        if asked.slopes {
+            let doubt = self.doubt(&found, f.pass.chi2 - found.pass.chi2);
+            found.rise.way_px2 = [x_px - f.x_px, y_px - f.y_px].map(|way| doubt * way * way);
+        }
         Some(Fitted {
             left: self.left_by(&found),
             ..found
         })
     }
 
-    /// The fit without the light of specks beside the bead, if what is left then is noise. Else the window is as it was: a wall or a
-    /// third speck is not explained by an ellipse, and bends it.
-    fn without_specks(&mut self, first: Fitted, side_px: usize) -> Fitted {
-        let mut specks = [None; MOST_SPECKS];
-        let mut last = None;
-        for slot in &mut specks {
-            let Some((found, speck)) = self.with_speck(last.as_ref().unwrap_or(&first)) else {
-                break;
-            };
-            (last, *slot) = (Some(found), Some(speck));
+    /// What a fit of rising light leaves, over what it has explained: the light's shape is known to that part. What is the same all round
+    /// is the bead's, not the light's, and chance says nothing either.
+    fn doubt(&mut self, f: &Fitted, explained: f64) -> f64 {
+        let at = (f.x_px, f.y_px);
+        let parts = (f.pass.amplitude, f.pass.background);
+        let left = self
+            .residues
+            .lopsided(&self.crop, &self.template, &self.comb, at, parts);
+        let noise = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
+        let pixels = (self.crop.width * self.crop.height) as f64;
+        let beyond = (left / noise - 1.0) * pixels - LEAST_EXCESS * (2.0 * pixels).sqrt();
+        let explained = explained / self.weight_unit();
+        if explained > 0.0 {
+            beyond.max(0.0) / explained
+        } else {
+            0.0
         }
-        let Some(last) = last else {
+    }
+
+    /// The fit without the light of specks beside the bead, if what is left then is noise. Else the window is as it was: a wall or a
+    /// third speck is not explained by an ellipse, and bends it. One of two specks may not pay its price while the light of the other
+    /// is left: then the two pay together.
+    fn without_specks(&mut self, first: Fitted, side_px: usize) -> Fitted {
+        let Some((one, speck, bill)) = self.with_speck(&first) else {
             return first;
         };
-        if self.leaves_noise(&last) {
+        let is_paid =
+            |this: &Self, bill: &Bill| bill.is_paid(&this.crop, this.template.radius_px());
+        let pays = is_paid(self, &bill);
+        let second = self.with_speck(&one);
+        // For a contrast of 1.
+        let covariance = |pass: &Pass| pass.covariance * (pass.amplitude * pass.amplitude);
+        let by_first = covariance(&one.pass) - covariance(&first.pass);
+        let mut last = pays.then_some(one);
+        let mut specks = [Some(speck), None];
+        if let Some((mut two, other, own)) = second {
+            // The first one's light is as uncertain as before: the last fit has taken it for known.
+            if by_first.diagonal().min() > 0.0 {
+                two.pass.covariance += by_first / (two.pass.amplitude * two.pass.amplitude);
+            }
+            if is_paid(self, &if pays { own } else { bill.and(&own) }) {
+                (last, specks[1]) = (Some(two), Some(other));
+            } else {
+                other.put_back(&mut self.crop);
+            }
+        }
+        if let Some(last) = last
+            && self.leaves_noise(&last)
+        {
             if side_px == self.config.window_px {
                 self.read_noise_beside(&last);
             }
@@ -145,15 +178,16 @@ impl Localiser {
         first
     }
 
-    /// The fit of a bead together with a speck beside it, whose light is taken off the window, if a speck explains more than its price.
-    fn with_speck(&mut self, f: &Fitted) -> Option<(Fitted, Speck)> {
+    /// The fit of a bead together with a speck beside it, whose light is taken off the window, and what the speck explains.
+    fn with_speck(&mut self, f: &Fitted) -> Option<(Fitted, Speck, Bill)> {
         let variance = self.least_variance(f);
         let own = self.pixel_variance(f.pass.background + f64::from(self.crop.pedestal));
         let unit = self.weight_unit() * variance / own;
         let pixels = (self.crop.width * self.crop.height) as f64;
         let before = f.pass.chi2 / unit;
         // What chance leaves moves the bead by less than its own noise.
-        if before < pixels + LEAST_EXCESS * (2.0 * pixels).sqrt() {
+        let chance = pixels + LEAST_EXCESS * (2.0 * pixels).sqrt();
+        if before < chance {
             return None;
         }
         let place = (f.x_px - self.crop.x0 as f64, f.y_px - self.crop.y0 as f64);
@@ -165,18 +199,26 @@ impl Localiser {
         let first = Speck::seen(&self.crop, left, place, radius_px, noise)?;
         let weights = self.weights(Some(&f.pass));
         let at = (f.x_px, f.y_px);
-        let both = dust::fit(&self.crop, &self.template, at, first, weights)?;
-        let other = f.left.explained_by_slope_and_size() / variance;
-        let gain = before - both.pass.chi2 / unit;
+        let fit = |speck| dust::fit(&self.crop, &self.template, at, speck, weights);
+        let mut both = fit(first);
+        if both.as_ref().is_none_or(|b| b.pass.chi2 / unit > chance) {
+            // A speck whose end is seen at the bead looks as wide as the bead's edge: a fit from there may end as a line along the edge.
+            let other = fit(first.rounded());
+            let is_better = |o: &Both| both.as_ref().is_none_or(|b| o.pass.chi2 < b.pass.chi2);
+            both = other.filter(is_better).or(both);
+        }
+        let both = both?;
         both.speck.take_off(&mut self.crop);
         let parts = (both.pass.amplitude, both.pass.background);
         let left =
             self.residues
                 .lopsided(&self.crop, &self.template, &self.comb, both.place_px, parts);
-        if !dust::pays(&self.crop, radius_px, gain, left / variance, other) {
-            both.speck.put_back(&mut self.crop);
-            return None;
-        }
+        let bill = Bill {
+            specks: 1,
+            gain: before - both.pass.chi2 / unit,
+            lopsided: left / variance,
+            other: f.left.explained_by_slope_and_size() / variance,
+        };
         let (x_px, y_px) = both.place_px;
         let found = Fitted {
             x_px,
@@ -187,7 +229,7 @@ impl Localiser {
             left: f.left,
         };
         let left = self.left_by(&found);
-        Some((Fitted { left, ..found }, both.speck))
+        Some((Fitted { left, ..found }, both.speck, bill))
     }
 
     /// Whether what a fit leaves is noise, besides its mean all round.

@@ -279,31 +279,41 @@ fn suggested_profiles_tell_the_truth_at_every_ratio() {
     suggested_profiles(|_, _| true);
 }
 
+/// Measured after twenty fixes were learnt from and twenty more made with what was learnt. Places are those of the fixes themselves, of
+/// the pixels that are averaged. Only a fix whose contrast is certain is learnt from: its place is off by a part of the bead's width, so
+/// that noise shows no profile. Faint places that noise has chosen, as a suggestion begins with, are none of them.
 fn profiles_learnt_in_the_loop(take: impl Fn(usize, usize) -> bool) {
+    // What is configured: a tenth too large, or another shape.
+    let gauss = |sigma_px| ProfileSpec::Gaussian { sigma_px };
+    let profiles = [
+        (gaussian(1.5), gauss(1.65)),
+        (gaussian(3.0), gauss(3.3)),
+        (gaussian(4.0), gauss(4.4)),
+        (ring(6.4), ProfileSpec::Ring { edge_px: 7.0 }),
+        (disc(4.0), gauss(2.6)),
+        (disc(9.0), gauss(6.0)),
+    ];
+    let ratios = [5.0, 10.0, 20.0, 40.0, 200.0];
     let mut failed = Vec::new();
-    for (of, sigma_px) in [1.5, 3.0].into_iter().enumerate() {
-        for (at, &snr) in RATIOS.iter().enumerate() {
+    for (of, ((name, profile), spec)) in profiles.iter().enumerate() {
+        for (at, &snr) in ratios.iter().enumerate() {
             if !take(of, at) {
                 continue;
             }
-            let (name, profile) = gaussian(sigma_px);
             let mut random = Random(23);
-            // Given a tenth too large.
-            let spec = ProfileSpec::Gaussian {
-                sigma_px: 1.1 * sigma_px,
-            };
             let config = LocaliserConfig {
                 learning: Some(Learning {
                     first_fixes: LEARNT_FROM as u32,
                     ..Learning::default()
                 }),
-                ..LocaliserConfig::new(spec)
+                ..LocaliserConfig::new(*spec)
             };
             let mut localiser = Localiser::new(config).unwrap();
             measured(&mut localiser, profile.as_ref(), snr, &mut random, 40);
             let score = measured(&mut localiser, profile.as_ref(), snr, &mut random, 1500);
+            assert_eq!(localiser.learning().taken, 1, "{name} at SNR {snr}");
             let bound_px = bound(profile.as_ref(), snr);
-            judge(&name, snr, &score, bound_px, &mut failed);
+            judge(name, snr, &score, bound_px, &mut failed);
         }
     }
     assert!(failed.is_empty(), "{failed:?}");
@@ -311,11 +321,12 @@ fn profiles_learnt_in_the_loop(take: impl Fn(usize, usize) -> bool) {
 
 #[test]
 fn profiles_learnt_in_the_loop_from_small_and_faint_beads_tell_the_truth() {
-    profiles_learnt_in_the_loop(|profile, ratio| ratio % 2 == profile);
+    // Each ratio once, of the profiles whose windows are not the widest.
+    profiles_learnt_in_the_loop(|profile, ratio| ratio == (2 * profile) % 5 && profile < 5);
 }
 
 #[test]
-#[ignore = "slow: both profiles at every ratio; the fast one has each ratio once"]
+#[ignore = "slow: every profile at every ratio; the fast one has each ratio once"]
 fn profiles_learnt_in_the_loop_tell_the_truth_at_every_ratio() {
     profiles_learnt_in_the_loop(|_, _| true);
 }

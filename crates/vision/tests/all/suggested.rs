@@ -326,5 +326,6 @@ fn every_other_pixel_of_measured_beads_shows_them_half_a_pixel_further_as_well_a
         "{count} steps of half a pixel: error {:.4} px a fix, over stated {ratio:.2}, {lies} beyond five standard deviations",
         (error2 / count / 4.0).sqrt()
     );
-    assert!(count > 500.0 && lies == 0 && (0.5..1.5).contains(&ratio));
+    // One of the five has a bacterium on it. Where its look counts as noise of the others and as a slope's, 0.51 is found.
+    assert!(count > 500.0 && lies == 0 && (0.53..1.5).contains(&ratio));
 }
