@@ -78,10 +78,8 @@ pub(crate) struct Rows {
     /// Position of each row, um, as if all commands had been on time; NaN without one.
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
-    /// The command of this row's tick came too late to stand as if on time, or never.
+    /// The command of this row's tick came too late to stand as if on time, or never: when the board had it is not known.
     late: Vec<bool>,
-    /// The row has no tick, or one that came a period too late: when the board had its command is not known.
-    pub(crate) stalled: Vec<bool>,
     /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
     /// The frame came in time and showed no reliable bead.
@@ -116,7 +114,6 @@ impl Rows {
             output: Vec::new(),
             usable: Vec::new(),
             late: Vec::new(),
-            stalled: Vec::new(),
             unseen: Vec::new(),
             without_bead: Vec::new(),
             repeated: Vec::new(),
@@ -155,7 +152,6 @@ impl Rows {
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
                 rows.late.push(true);
-                rows.stalled.push(true);
                 rows.unseen.push(false);
                 rows.without_bead.push(false);
                 rows.repeated.push(false);
@@ -168,7 +164,6 @@ impl Rows {
                 row: row as f64 + ns as f64 / period_ns as f64,
                 um: tick.command_um,
             }));
-            rows.stalled[row] = late_ns.is_none_or(|ns| ns.abs() >= period_ns);
             // A command half a period late stands nearer to another row: the machine stalled.
             let late_ns = late_ns.filter(|ns| 2 * ns.abs() < period_ns);
             rows.late[row] = late_ns.is_none();
@@ -211,7 +206,7 @@ impl Rows {
             bead_um,
             unseen: self.unseen,
             frame_age_s,
-            late_command: self.stalled,
+            late_command: self.late,
         }
     }
 

@@ -382,3 +382,18 @@ fn a_run_with_skipped_ticks_is_a_record_by_its_frames() {
     assert!(skipped > 20, "{skipped}");
     assert_eq!(record.rows(), row(closed[closed.len() - 1]) + 1);
 }
+
+/// A command more than half a period late stands nearer to another row. When the board had it nobody here knows.
+#[test]
+fn the_motion_of_a_command_that_is_over_half_a_period_late_is_open() {
+    let mut ticks = ticks(7.0, 2000, &CALM);
+    let first = ticks.iter().position(TickRecord::is_running).unwrap();
+    for (row, part) in [(300, 0.3), (600, 0.7), (900, 1.4)] {
+        ticks[first + row].compute_ns += (part * PERIOD_NS as f64) as u32;
+    }
+    let record = crate::experiment::collect::of_ticks("run", &ticks, 1e-3).unwrap();
+    let open: Vec<usize> = (0..record.rows())
+        .filter(|row| record.late_command[*row])
+        .collect();
+    assert_eq!(open, [600, 900]);
+}
