@@ -167,7 +167,7 @@ impl Context<'_> {
             match part.variant().role {
                 Role::Chain => {
                     for (j, p) in part.variant().params.iter().enumerate() {
-                        let (parts, step) = self.nudged(&fit.parts, index, j, p);
+                        let (parts, step) = nudged(&fit.parts, index, j, p);
                         let moved = self.simulated(&parts, fit.offset_um, mask);
                         for (i, r) in records.iter().enumerate().filter(|(i, _)| counted(*i)) {
                             let d: Vec<f64> = moved[i]
@@ -263,25 +263,56 @@ impl Context<'_> {
             columns[i].push((index, r.whitened(&d)));
         }
     }
+}
 
-    /// The parts with one parameter moved by its step, towards the inside of its bounds.
-    fn nudged(&self, parts: &[Part], index: usize, j: usize, p: &FitParameter) -> (Vec<Part>, f64) {
-        let mut parts = parts.to_vec();
-        let x = parts[index].theta[j];
-        let mut step = p.step
-            * if p.log {
-                1.0
-            } else {
-                (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0)
-            };
+/// The parts with one parameter moved by its step, towards the inside of its bounds.
+fn nudged(parts: &[Part], index: usize, j: usize, p: &FitParameter) -> (Vec<Part>, f64) {
+    let mut parts = parts.to_vec();
+    let x = parts[index].theta[j];
+    let mut step = p.step
+        * if p.log {
+            1.0
+        } else {
+            (x.abs() / (50.0 * p.step)).clamp(1.0, 10.0)
+        };
+    parts[index].theta[j] = x + step;
+    // Another of the numbers may be its bound.
+    let mut within = parts[index].clone();
+    within.keep_within_bounds();
+    if (within.theta[j] - x) * step < (1.0 - 1e-6) * step * step {
+        step = -step;
         parts[index].theta[j] = x + step;
-        // Another of the numbers may be its bound.
-        let mut within = parts[index].clone();
-        within.keep_within_bounds();
-        if (within.theta[j] - x) * step < (1.0 - 1e-6) * step * step {
-            step = -step;
-            parts[index].theta[j] = x + step;
+    }
+    (parts, step)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::catalogue;
+
+    #[test]
+    fn a_number_beyond_what_another_allows_comes_back_and_has_a_derivative_there() {
+        let variants = catalogue::variants(&[]);
+        let part = |id: &str, name: &str, values: &[f64]| {
+            let of_name = |v: &&catalogue::Variant| v.id() == id && v.candidate().name == name;
+            let mut part = Part::new(*variants.iter().find(of_name).unwrap(), values);
+            part.keep_within_bounds();
+            part
+        };
+        // Beyond beta; a stop above the break; the end of a range below its start.
+        let cases = [
+            (part("pzt-hysteresis", "bouc-wen", &[0.2, 1.5, 1.8]), 2, 1.5),
+            (part("stick-slip", "", &[20.0, 30.0]), 1, 20.0),
+            (part("saturation", "", &[19.0, 18.0]), 1, 19.001),
+        ];
+        for (part, j, bound) in cases {
+            let values = part.natural();
+            assert!((values[j] - bound).abs() < 1e-9 * bound, "{values:?}");
+            let p = &part.variant().params[j];
+            let (moved, step) = nudged(std::slice::from_ref(&part), 0, j, p);
+            let moved = p.coordinate(moved[0].natural()[j]) - part.theta[j];
+            assert!((moved / step - 1.0).abs() < 1e-6, "{moved} {step}");
         }
-        (parts, step)
     }
 }
