@@ -231,18 +231,6 @@ impl CellFinder {
         &self.cells
     }
 
-    /// Shift of the last frame against the background, px to the right and down, for which it was corrected; zeros if it was
-    /// negligible.
-    pub fn drift_px(&self) -> (f64, f64) {
-        self.moved.shift_px
-    }
-
-    /// How much softer the last frame is than the background, px: the standard deviation of the Gaussian by which the background
-    /// was blurred before it was subtracted; 0 for a frame in the background's focus.
-    pub fn blur_px(&self) -> f64 {
-        self.moved.blur_px
-    }
-
     /// Regions of the last frame that stood out but have no outline, or one smaller than a cell.
     pub fn dust(&self) -> u32 {
         self.dust

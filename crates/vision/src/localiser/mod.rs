@@ -196,11 +196,6 @@ impl Localiser {
         self.sign
     }
 
-    /// Noise variance of a pixel in use at the background, grey^2; `None` before the first frame.
-    pub fn noise_variance(&self) -> Option<f64> {
-        self.noise_variance
-    }
-
     /// How far the learning of the template has come.
     pub fn learning(&self) -> LearningReport {
         self.learner
