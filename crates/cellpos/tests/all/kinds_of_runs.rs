@@ -131,6 +131,18 @@ fn compared(at: &Path, kind: &str, run: &Path) {
 
 #[test]
 fn every_kind_of_run_goes_through_every_command_that_reads_one() {
+    // A run of two sessions, one of a cell through frames, and one without an end: what the others lack or have is among it.
+    through_every_command(|kind| ["resumed", "cell", "killed"].contains(&kind));
+}
+
+#[test]
+#[ignore = "nightly: models are fitted to every kind; the fast one fits them to three"]
+fn every_kind_of_run_is_compared_with_a_model() {
+    through_every_command(|_| true);
+}
+
+/// Every kind exported, replayed and reported, and those that are asked for compared with a model.
+fn through_every_command(is_compared: impl Fn(&str) -> bool + Sync) {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     script(at);
@@ -214,7 +226,9 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
             at,
             &format!("simulate --model eq6 --input {path} --out {simulated}"),
         );
-        compared(at, kind, run);
+        if is_compared(kind) {
+            compared(at, kind, run);
+        }
     });
     let (_, resumed) = &runs[4];
     let of_sessions = succeed(at, &format!("export {} --force --json", resumed.display())).json();

@@ -142,7 +142,8 @@ fn nohup_holds_and_without_it_the_end_of_a_terminal_is_an_orderly_end() {
 
 #[test]
 fn a_signal_in_the_first_moments_leaves_no_run_half_way() {
-    for delay_ms in [0, 6, 15, 30, 50, 90] {
+    // The later ones find it running, as the signals of other tests do.
+    for delay_ms in [0, 15, 50] {
         let folder = tempfile::tempdir().unwrap();
         let child = start(folder.path(), TRACK);
         std::thread::sleep(Duration::from_millis(delay_ms));

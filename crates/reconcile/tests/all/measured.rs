@@ -402,6 +402,10 @@ upper_0 = { unit = "V", lower = 0.0, upper = 80.0, start = [5.0, 30.0] }
 "#;
 
 #[test]
+#[cfg_attr(
+    not(no_shared_data),
+    ignore = "nightly: 5 s of a debug build; the fast one has a spring from a file"
+)]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/measured")]
 fn tanks_with_an_overflow_from_a_file_follow_what_they_have_not_seen() {
     let s = set(

@@ -18,13 +18,14 @@ fn named(r: &Reconciliation) -> Vec<&str> {
 }
 
 /// A flow of this wandering (um, s) and drift (um/s) leaves the delay as the only name.
-fn moves(wander_um: f64, time_s: f64, drift_um_per_s: f64, seed: u64) {
+fn moves(wander_um: f64, time_s: f64, drift_um_per_s: f64, seed: u64, options: &Options) {
     let flow = Flow {
         wander_um,
         time_s,
         drift_um_per_s,
     };
-    let r = run(closed_loop(flow, Hidden::Nothing, tones, seed));
+    let record = closed_loop(flow, Hidden::Nothing, tones, seed);
+    let r = run_from(record, WORKING_POINT_UM, options, Vec::new());
     assert_eq!(named(&r), ["time-delay"], "{:?} {:?}", r.places, r.noise);
     assert_eq!(r.verdict, Verdict::Named, "{:?}", r.remainder);
     assert!(r.noise.zero_flow.is_some(), "{:?}", r.noise);
@@ -32,13 +33,24 @@ fn moves(wander_um: f64, time_s: f64, drift_um_per_s: f64, seed: u64) {
 
 #[test]
 fn a_zero_flow_that_moves_is_no_effect_of_the_response() {
-    moves(0.02, 5.0, 0.0, 41);
+    // The delay and no search for a second name.
+    let one = Options {
+        max_effects: 1,
+        ..Options::default()
+    };
+    moves(0.02, 5.0, 0.0, 41, &one);
+}
+
+#[test]
+#[ignore = "nightly: a second name is looked for as well; the fast one looks for one"]
+fn a_zero_flow_that_moves_leaves_nothing_to_name_beside_the_delay() {
+    moves(0.02, 5.0, 0.0, 41, &Options::default());
 }
 
 #[test]
 #[ignore = "slow: the fast one has a flow that wanders alone; for the nightly run"]
 fn a_zero_flow_that_drifts_is_no_effect_of_the_response() {
-    moves(0.002, 50.0, 0.005, 42);
+    moves(0.002, 50.0, 0.005, 42, &Options::default());
 }
 
 #[test]

@@ -94,19 +94,13 @@ fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn changed_frames() {
     frames_changed_by(&[
-        ("as recorded", 0.0, 0.0, 0.0),
-        ("frame blurred 1", 1.0, 0.0, 0.0),
-        ("frame blurred 2", 2.0, 0.0, 0.0),
         ("frame blurred 4", 4.0, 0.0, 0.0),
-        ("walls moved 3", 0.0, 1.34, 2.68),
-        ("walls moved -3 across", 0.0, 0.0, -3.0),
-        ("walls moved 3 along", 0.0, 3.0, 0.0),
         ("moved 2, blurred 1", 1.0, 0.9, 1.79),
     ]);
 }
 
 #[test]
-#[ignore = "nightly: every row of the table; the fast one has each kind of change, and the largest"]
+#[ignore = "nightly: every row of the table; the fast one has the largest blur, and both together"]
 fn changed_frames_every_row() {
     frames_changed_by(&[
         ("as recorded", 0.0, 0.0, 0.0),
