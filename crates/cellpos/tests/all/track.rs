@@ -240,9 +240,13 @@ fn each_fault_ends_as_it_should_and_is_named() {
             format!("[emulator]\nnew_bead_after_ms = 300.0\n[emulator.faults]\n{fault}\n"),
         )
         .unwrap();
+        // What happens to the bead, or while it is not seen, happens in pictures.
+        let frames = if fault.contains("-bead") { "on" } else { "off" };
         let ran = cellpos(
             folder.path(),
-            "track --target 0um --duration 3s --clock virtual --frames on --json --rig rig.toml",
+            &format!(
+                "track --target 0um --duration 3s --clock virtual --frames {frames} --json --rig rig.toml"
+            ),
         );
         let r = ran.json();
         assert_eq!(r["safe_reason"].as_str(), safe_reason, "{fault}\n{r}");
@@ -467,8 +471,8 @@ fn a_sine_that_no_loop_can_follow_is_refused_and_every_law_follows_the_others() 
 
 #[test]
 fn the_bead_is_found_where_the_zero_flow_has_drifted_since_it_was_measured() {
-    // 1 nm/s over 3 and 7 minutes. At 0.5 um a bead passes faster than the tracker takes it for one.
-    for off_um in [0.2, 0.4, -0.4] {
+    // 1 nm/s over 7 minutes. At 0.5 um a bead passes faster than the tracker takes it for one.
+    for off_um in [0.4, -0.4] {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(
             folder.path().join("rig.toml"),
@@ -479,7 +483,7 @@ fn the_bead_is_found_where_the_zero_flow_has_drifted_since_it_was_measured() {
         )
         .unwrap();
         let line =
-            "track --target 0um --duration 5s --clock virtual --frames on --json --rig rig.toml";
+            "track --target 0um --duration 3s --clock virtual --frames on --json --rig rig.toml";
         let r = succeed(folder.path(), line).json();
         println!("{off_um} um: {} nm", r["rms_true_nm"]);
         let held_nm = r["rms_true_nm"].as_f64().unwrap();
