@@ -141,10 +141,8 @@ fn every_kind_of_run_is_compared_with_a_model() {
     through_every_command(|_| true);
 }
 
-/// Every kind exported, replayed and reported, and those that are asked for compared with a model.
-fn through_every_command(is_compared: impl Fn(&str) -> bool + Sync) {
-    let folder = tempfile::tempdir().unwrap();
-    let at = folder.path();
+/// A run of each kind.
+fn one_of_each_kind(at: &Path) -> [(&'static str, PathBuf); 8] {
     script(at);
     let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
     let learn = "--sine 2um@20Hz --learn --duration 6s --name learned";
@@ -162,7 +160,7 @@ fn through_every_command(is_compared: impl Fn(&str) -> bool + Sync) {
     let meta = std::fs::read_to_string(bare.join("run.toml")).unwrap();
     let end = meta.find("[end.summary]").unwrap();
     std::fs::write(bare.join("run.toml"), &meta[..end]).unwrap();
-    let runs = [
+    [
         (
             "track",
             made(at, &format!("track --target 1um --duration 6s {FAST}")),
@@ -192,7 +190,14 @@ fn through_every_command(is_compared: impl Fn(&str) -> bool + Sync) {
         ),
         ("killed", cut),
         ("without a summary", bare),
-    ];
+    ]
+}
+
+/// Every kind exported, replayed and reported, and those that are asked for compared with a model.
+fn through_every_command(is_compared: impl Fn(&str) -> bool + Sync) {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let runs = one_of_each_kind(at);
     map(&runs, 2, |(kind, run)| {
         let path = run.display();
         let exported: Value = succeed(at, &format!("export {path} --json")).json();

@@ -154,13 +154,15 @@ fn a_plant_with_the_wrong_sign_or_gain_is_not_run_at_all() {
     }
 }
 
+/// A fault, and what it must lead to.
+struct Case {
+    fault: &'static str,
+    safe_reason: Option<&'static str>,
+    events: &'static [&'static str],
+}
+
 #[test]
 fn each_fault_ends_as_it_should_and_is_named() {
-    struct Case {
-        fault: &'static str,
-        safe_reason: Option<&'static str>,
-        events: &'static [&'static str],
-    }
     let case = |fault, safe_reason, events| Case {
         fault,
         safe_reason,
