@@ -118,20 +118,10 @@ impl Held {
 
 #[test]
 fn a_loop_faster_than_its_camera_adapts_over_the_spread_and_states_gains_that_are_right() {
-    adapts_over_the_spread(1);
-}
-
-#[test]
-#[ignore = "nightly: four seeds each; the fast one has the first"]
-fn a_loop_faster_than_its_camera_states_gains_that_are_right_whatever_the_seed() {
-    adapts_over_the_spread(4);
-}
-
-fn adapts_over_the_spread(seeds: u64) {
     let (mut stated, mut outside) = (0, 0);
     for (every, other) in [1, 2, 5]
         .into_iter()
-        .flat_map(|every| (0..seeds).map(move |n| (every, n)))
+        .flat_map(|every| (0..4).map(move |n| (every, n)))
     {
         let seed = 7 + first_seed() + 100 * other;
         let mut held = Held::new(ControllerConfig::Lqg(Lqg::default()), every, true, seed);
@@ -168,7 +158,7 @@ fn adapts_over_the_spread(seeds: u64) {
             assert!(!events.is_empty(), "{every}, {gain}: nothing told");
         }
     }
-    // The estimate remembers 8 s: the 9 stays of a seed are 11 looks or so.
+    // The estimate remembers 8 s: the 36 stays are 45 looks or so.
     println!("{outside} of {stated} outside");
     assert!(outside * 10 <= stated, "{outside} of {stated}");
 }
