@@ -48,7 +48,8 @@ fn ids(r: &Reconciliation) -> Vec<&str> {
 
 #[test]
 fn an_error_that_the_model_states_is_no_effect() {
-    let r = beside_a_long_delay(Hidden::Nothing, true, 4, 81);
+    // What has no first name has no second.
+    let r = beside_a_long_delay(Hidden::Nothing, true, 1, 81);
     assert_eq!(r.verdict, Verdict::NothingMissing, "{:?}", r.places);
     // The same error is a disagreement where the model states none, whatever would be named after the first.
     let r = beside_a_long_delay(Hidden::Nothing, false, 1, 81);
