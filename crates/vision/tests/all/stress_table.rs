@@ -348,12 +348,12 @@ fn few_rows(kinds: usize, beads: f64, take: impl Fn(usize) -> bool) {
 
 #[test]
 fn a_few_rows_of_the_table_keep_their_limits() {
-    // Each way once, the settings in turn. Without the two kinds of the widest windows, which take half of the time.
-    few_rows(7, 40.0, |k| (k + k / 12).is_multiple_of(2));
+    // Ways that have no quick test of their own, once each, with either settings. Without the two kinds of the widest windows.
+    few_rows(7, 40.0, |k| [2, 6, 10, 13, 17, 19, 23].contains(&k));
 }
 
 #[test]
-#[ignore = "slow: each way to spoil a picture with both settings; the fast one has each way once, and fewer beads"]
+#[ignore = "slow: each way to spoil a picture with both settings; the fast one has those without a test of their own, and fewer beads"]
 fn each_way_to_spoil_a_picture_with_both_settings_keeps_its_limits() {
     few_rows(9, 100.0, |_| true);
 }
