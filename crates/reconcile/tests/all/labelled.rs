@@ -151,7 +151,7 @@ fn leak_and_hum_together_are_both_named() {
 }
 
 #[test]
-#[ignore = "nightly: the fast ones are the other records that hide nothing"]
+#[ignore = "nightly: the fast ones have records of linear models, and a loop that hides nothing"]
 fn records_that_hide_nothing_get_no_name() {
     expect("none-1", &[]);
 }

@@ -308,7 +308,7 @@ fn given(name: &str, otherwise: usize) -> usize {
 }
 
 #[test]
-#[ignore = "slow: every row of the table; the fast one has each way to spoil a picture"]
+#[ignore = "slow: every row of the table; the fast ones have each way to spoil a picture"]
 fn the_whole_table_keeps_its_limits() {
     let rows = (0..9).flat_map(|kind| {
         [5.0, 10.0, 40.0, 200.0].into_iter().flat_map(move |snr| {
@@ -391,7 +391,7 @@ fn a_profile_is_learnt_from_the_beads_that_it_fits() {
 }
 
 #[test]
-#[ignore = "nightly: discs that blur; the fast one has beads beside each other"]
+#[ignore = "nightly: discs that blur"]
 fn a_profile_is_learnt_from_discs_out_of_focus() {
     // They come in parts.
     let rows = [(7, 40.0, Settings::Suggested, Spoil::Defocus(1.15))];
