@@ -12,7 +12,7 @@ const STATED_S: f64 = 1.5e-4;
 fn beside_a_long_delay(
     hidden: Hidden,
     stated: bool,
-    options: Options,
+    max_effects: usize,
     seed: u64,
 ) -> Reconciliation {
     let flow = Flow {
@@ -35,7 +35,8 @@ fn beside_a_long_delay(
     });
     let options = Options {
         free_working_point: true,
-        ..options
+        max_effects,
+        ..Options::default()
     };
     let record = closed_loop(flow, hidden, survey, seed);
     reconcile(&model, &[record], &options, &mut |_| {}).unwrap()
@@ -47,27 +48,17 @@ fn ids(r: &Reconciliation) -> Vec<&str> {
 
 #[test]
 fn an_error_that_the_model_states_is_no_effect() {
-    // What has no first name has no second.
-    let one = Options {
-        max_effects: 1,
-        ..Options::default()
-    };
-    let r = beside_a_long_delay(Hidden::Nothing, true, one, 81);
+    let r = beside_a_long_delay(Hidden::Nothing, true, 4, 81);
     assert_eq!(r.verdict, Verdict::NothingMissing, "{:?}", r.places);
-    // The same error is a disagreement where the model states none, whatever a search would make of it.
-    let short = Options {
-        max_effects: 1,
-        work: 1e-4,
-        ..Options::default()
-    };
-    let r = beside_a_long_delay(Hidden::Nothing, false, short, 81);
+    // The same error is a disagreement where the model states none, whatever would be named after the first.
+    let r = beside_a_long_delay(Hidden::Nothing, false, 1, 81);
     assert_ne!(r.verdict, Verdict::NothingMissing, "{:?}", r.places);
 }
 
 #[test]
 #[ignore = "18 s of a debug build: for .ci/nightly"]
 fn an_effect_beside_it_has_its_name_and_an_interval_with_that_error_in_it() {
-    let r = beside_a_long_delay(Hidden::Lag(120.0), true, Options::default(), 82);
+    let r = beside_a_long_delay(Hidden::Lag(120.0), true, 4, 82);
     assert_eq!(ids(&r), ["driver-lag"], "{:?}", r.places);
     let hz = &r.effects[0].parameters["bandwidth_hz"];
     let half = 0.5 * (hz.ci95[1] - hz.ci95[0]);
