@@ -133,13 +133,23 @@ fn what_is_at_work_in_a_part_of_a_record_alone_is_named() {
 
 #[test]
 fn a_zero_flow_that_stands_still_is_not_said_to_move() {
+    stands_still(&one());
+}
+
+#[test]
+#[ignore = "nightly: a second name is looked for as well; the fast one looks for one"]
+fn a_zero_flow_that_stands_still_leaves_nothing_to_name_beside_the_delay() {
+    stands_still(&Options::default());
+}
+
+fn stands_still(options: &Options) {
     let flow = Flow {
         wander_um: 0.0,
         time_s: 1.0,
         drift_um_per_s: 0.0,
     };
     let record = closed_loop(flow, Hidden::Nothing, tones, 60);
-    let r = run_from(record, WORKING_POINT_UM, &one(), Vec::new());
+    let r = run_from(record, WORKING_POINT_UM, options, Vec::new());
     assert_eq!(named(&r), ["time-delay"], "{:?}", r.places);
     assert!(r.noise.zero_flow.is_none(), "{:?}", r.noise);
 }
