@@ -17,7 +17,7 @@ fn each_fault_ends_as_it_should_and_is_named() {
 }
 
 #[test]
-#[ignore = "nightly: every fault through frames, 14 s of a debug build; the fast one has those of the bead so"]
+#[ignore = "nightly: every fault through frames, 8 s of a debug build; the fast one has those of the bead so"]
 fn each_fault_ends_as_it_should_through_frames() {
     each_fault(|_| true);
 }
