@@ -209,7 +209,8 @@ fn a_point_stands_where_the_axes_say() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(64))]
+    // A debug build draws fewer: the nightly run, a release build, draws all, and others each night.
+    #![proptest_config(ProptestConfig::with_cases(if cfg!(debug_assertions) { 16 } else { 64 }))]
 
     #[test]
     fn any_text_and_any_numbers_give_a_well_formed_page(

@@ -5,15 +5,18 @@
 //! tilt. Its length is K in pixels. If the pixel size is known, it is compared with the model, so a pixel size that is wrong by a
 //! factor is noticed.
 
+mod fit;
+
 use crate::bench::Bench;
-use crate::mover::Mover;
+use crate::mover::{Mover, stopped};
 use crate::rig_text::change;
 use crate::watch::{Sighting, Watch};
 use cellpos_drivers::{Axis, CalibrationFile};
 use cellpos_plant::{Hertz, TransferFunction};
 use cellpos_rig::Clock;
 use cellpos_runtime::realtime;
-use cellpos_session::Failure;
+use cellpos_session::{Failure, signals};
+use fit::fit;
 use serde::Serialize;
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -177,10 +180,17 @@ fn pulsed(
         ));
     }
     let (commands, end_ns) = on_a_thread_of_its_own(&mut watch, &mut mover, pulses, progress)?;
-    drop(mover);
+    let_go(mover, signals::stopped_by)?;
     let size_px = watch.size_px();
     let sightings = watch.finish(end_ns)?;
     Ok(fit(&commands, &sightings, size_px).ok_or(sightings.len()))
+}
+
+/// Parks the PZT. Until then a signal asks for a stop, which a step refuses; after the last step only this does. From here on a signal
+/// ends the program.
+fn let_go(mover: Mover, stopped_by: impl FnOnce() -> Option<&'static str>) -> Result<(), Failure> {
+    drop(mover);
+    stopped_by().map_or(Ok(()), |signal| Err(stopped(signal)))
 }
 
 /// The commands, as time (ns) and offset from the PZT's displacement (um), and the time of the end.
@@ -271,80 +281,6 @@ fn is_well_in_view(sightings: &[Sighting], size_px: [usize; 2], now_ns: i64) -> 
         })
 }
 
-/// Mean of the commanded offset from `from_ns` to `to_ns`.
-fn mean_offset(commands: &[(i64, f64)], from_ns: i64, to_ns: i64) -> f64 {
-    let mut sum = 0.0;
-    for (k, &(since_ns, offset_um)) in commands.iter().enumerate() {
-        let until_ns = commands.get(k + 1).map_or(i64::MAX, |next| next.0);
-        let (a, b) = (since_ns.max(from_ns), until_ns.min(to_ns));
-        if a < b {
-            sum += offset_um * (b - a) as f64;
-        }
-    }
-    sum / (to_ns - from_ns) as f64
-}
-
-/// Velocity against offset, by least squares with a constant for drift and zero flow, at the lag with the smallest residual. (The
-/// slope does not show the lag: averaged over a wrong lag, pulses and responses both shrink.)
-fn fit(commands: &[(i64, f64)], sightings: &[Sighting], size_px: [usize; 2]) -> Option<Response> {
-    const LONGEST_GAP_NS: i64 = 20_000_000;
-    let mut sorted = sightings.to_vec();
-    sorted.sort_by_key(|s| s.at_ns);
-    let pairs: Vec<(Sighting, Sighting)> = (sorted.windows(2))
-        .map(|pair| (pair[0], pair[1]))
-        .filter(|(a, b)| (1..LONGEST_GAP_NS).contains(&(b.at_ns - a.at_ns)))
-        .collect();
-    if pairs.len() < 50 {
-        return None;
-    }
-    // A lag that is 0.25 ms off takes 3 % of the slope of pulses of 15 ms.
-    (-10..=60)
-        .map(|tenth_ms| regress(commands, &pairs, tenth_ms * 100_000, size_px))
-        .min_by(|a, b| a.0.total_cmp(&b.0))
-        .map(|(_, response)| response)
-}
-
-/// The residual sum of squares of a lag, (px/s)^2, and its fit.
-fn regress(
-    commands: &[(i64, f64)],
-    pairs: &[(Sighting, Sighting)],
-    lag_ns: i64,
-    size_px: [usize; 2],
-) -> (f64, Response) {
-    let n = pairs.len() as f64;
-    let rows: Vec<(f64, [f64; 2])> = pairs
-        .iter()
-        .map(|(a, b)| {
-            let s = (b.at_ns - a.at_ns) as f64 * 1e-9;
-            let u = mean_offset(commands, a.at_ns - lag_ns, b.at_ns - lag_ns);
-            (u, [(b.x_px - a.x_px) / s, (b.y_px - a.y_px) / s])
-        })
-        .collect();
-    let mean_u = rows.iter().map(|(u, _)| u).sum::<f64>() / n;
-    let suu = rows.iter().map(|(u, _)| (u - mean_u).powi(2)).sum::<f64>();
-    let mut gain = [0.0; 2];
-    let mut residual = 0.0;
-    for (axis, gain) in gain.iter_mut().enumerate() {
-        let mean_v = rows.iter().map(|(_, v)| v[axis]).sum::<f64>() / n;
-        let suv: f64 = rows
-            .iter()
-            .map(|(u, v)| (u - mean_u) * (v[axis] - mean_v))
-            .sum();
-        *gain = suv / suu.max(f64::MIN_POSITIVE);
-        residual += (rows.iter())
-            .map(|(u, v)| (v[axis] - mean_v - *gain * (u - mean_u)).powi(2))
-            .sum::<f64>();
-    }
-    let response = Response {
-        gain_px_per_s: gain,
-        sd_px_per_s: (residual / (2.0 * n - 4.0) / suu.max(f64::MIN_POSITIVE)).sqrt(),
-        lag_ms: lag_ns as f64 * 1e-6,
-        frames: pairs.len() + 1,
-        size_px,
-    };
-    (residual, response)
-}
-
 /// Names a calibration file in a rig file, and removes a table `[calibration]` or another file's name. A file in the same folder is named
 /// without path, so that both can be moved; any other by its full path.
 ///
@@ -370,72 +306,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_bead_that_goes_with_the_pulses_shows_axis_sign_tilt_and_gain_through_drift() {
-        // 500 frames with a drift of 300 px/s. The gain is 4000 px/s per um, up and to the left at 10 degrees from the rows.
-        let tilt = 170_f64.to_radians();
-        let (gx, gy) = (4000.0 * tilt.cos(), 4000.0 * tilt.sin());
-        let commands: Vec<(i64, f64)> = (0..500)
-            .map(|k| {
-                (
-                    k * 1_000_000,
-                    if (k + 7) / 15 % 2 == 0 { 0.2 } else { -0.2 },
-                )
-            })
-            .collect();
-        let (mut x, mut y) = (100.0, 30.0);
-        let lag_ns = 2_200_000;
-        let sightings: Vec<Sighting> = (10..500)
-            .map(|k| {
-                let u = mean_offset(
-                    &commands,
-                    (k - 1) * 1_000_000 - lag_ns,
-                    k * 1_000_000 - lag_ns,
-                );
-                x += (gx * u + 300.0) * 1e-3;
-                y += gy * u * 1e-3;
-                Sighting {
-                    at_ns: k * 1_000_000,
-                    x_px: x,
-                    y_px: y,
-                }
-            })
-            .collect();
-        let response = fit(&commands, &sightings, [256, 64]).expect("enough frames");
-        let (axis, sign, tilt_deg, _) = response.direction();
-        assert_eq!((axis, sign), (Axis::X, -1));
-        assert!((tilt_deg + 10.0).abs() < 0.5, "{tilt_deg}");
-        assert!((response.gain() - 4000.0).abs() < 20.0, "{response:?}");
-        assert!((response.lag_ms - 2.2).abs() < 1e-9, "{response:?}");
-        let file = response.calibration(0.1, 0.001, "test".to_string());
-        assert_eq!((file.axis, file.sign, file.origin_px), (Axis::X, -1, 127.5));
-    }
-
-    #[test]
-    fn the_gain_of_a_plant_is_that_which_its_pulses_show() {
-        // The paper's plant, integrated in steps of 0.1 ms, frames each ms.
-        let plant = TransferFunction::eq6();
-        let pulses = Pulses::default();
-        let (k, b1, b0, a1, a0) = (0.01872, 20_261.5, 1_745_041.0, 76.3, 0.13);
-        let (mut state, mut commands, mut sightings) = ([0.0_f64; 2], Vec::new(), Vec::new());
-        for ms in 0..2 * pulses.length_ms * pulses.pairs {
-            let is_up = ((ms + pulses.length_ms / 2) / pulses.length_ms).is_multiple_of(2);
-            let u = if is_up { 0.2 } else { -0.2 };
-            let at_ns = i64::from(ms) * 1_000_000;
-            commands.push((at_ns, u));
-            let um = k * ((b0 - a0) * state[0] + (b1 - a1) * state[1] + u);
-            sightings.push(Sighting {
-                at_ns,
-                x_px: 10.0 * um,
-                y_px: 0.0,
-            });
-            for _ in 0..10 {
-                let slope = [state[1], u - a1 * state[1] - a0 * state[0]];
-                state = [0, 1].map(|i| state[i] + 1e-4 * slope[i]);
-            }
+    fn a_stop_after_the_last_pulse_is_an_end_as_one_before_it() {
+        let mut file = cellpos_session::RigFile::default();
+        file.board.power_up_um = 20.0;
+        let bench = Bench::of(file).expect("a bench");
+        for (signal, says) in [(None, None), (Some("SIGINT"), Some("stopped by SIGINT"))] {
+            let mover = Mover::arm(bench.board().expect("a board"), bench.file()).expect("armed");
+            let ended = let_go(mover, || signal);
+            let said = ended.err().map(|failure| format!("{failure:?}"));
+            let as_asked = said
+                .as_deref()
+                .zip(says)
+                .map(|(all, part)| all.contains(part));
+            assert_eq!(as_asked, says.map(|_| true), "{said:?}");
+            assert_eq!(said.is_some(), says.is_some(), "{said:?}");
         }
-        let shown = fit(&commands, &sightings, [256, 64]).expect("enough frames");
-        let ratio = shown.gain() / 10.0 / pulses.velocity_gain_per_s(&plant);
-        assert!((ratio - 1.0).abs() < 0.01, "{ratio}");
     }
 
     #[test]
@@ -486,15 +371,5 @@ mod tests {
         let mut moving = seen(100.0, 15.0);
         moving.extend(seen(250.0, 15.0));
         assert!(!is_well(&moving, 25));
-    }
-
-    #[test]
-    fn a_few_frames_are_not_enough() {
-        let sightings = [Sighting {
-            at_ns: 0,
-            x_px: 0.0,
-            y_px: 0.0,
-        }; 10];
-        assert_eq!(fit(&[(0, 0.1)], &sightings, [10, 10]), None);
     }
 }

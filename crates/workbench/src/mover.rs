@@ -109,8 +109,7 @@ impl Mover {
             ));
         }
         if let Some(signal) = signals::stopped_by() {
-            let stopped = format!("stopped by {signal}: the PZT is parked");
-            return Err(Failure::failed(std::io::Error::other(stopped)));
+            return Err(stopped(signal));
         }
         self.clock.sleep_until_ns(self.due_ns);
         let now_ns = self.clock.now_ns();
@@ -151,6 +150,12 @@ impl Drop for Mover {
         // If this fails, the board's own watchdog parks.
         let _ = self.board.disarm();
     }
+}
+
+/// The end that a signal asks for.
+pub(crate) fn stopped(signal: &str) -> Failure {
+    let stopped = format!("stopped by {signal}: the PZT is parked");
+    Failure::failed(std::io::Error::other(stopped))
 }
 
 #[cfg(test)]

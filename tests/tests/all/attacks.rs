@@ -30,7 +30,7 @@ fn damaged_inputs_get_an_answer() {
 #[test]
 fn a_hostile_camera_costs_no_tick_its_record() {
     // On the virtual clock.
-    stands_beside_others(attack::cameras::hostile_cameras, 6);
+    stands_beside_others(attack::cameras::hostile_cameras, 4);
 }
 
 #[test]

@@ -181,6 +181,7 @@ fn a_stranger_of_a_seed_gets_no_name_and_a_noise_that_is_slow_or_in_steps_none_e
 }
 
 #[test]
+#[ignore = "nightly: 4 s of a debug build; the fast one, in cellpos-reconcile, has 24 records without a floor"]
 fn without_rest_repeat_or_stated_noise_nothing_of_the_simulator_is_named() {
     for case in floorless(17).into_iter().skip(1).take(2) {
         let row = evaluate(&case, 17).unwrap();

@@ -68,7 +68,8 @@ fn event() -> impl Strategy<Value = Event> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(400))]
+    // A debug build draws fewer: the nightly run, a release build, draws all, and others each night.
+    #![proptest_config(ProptestConfig::with_cases(if cfg!(debug_assertions) { 100 } else { 400 }))]
 
     #[test]
     fn whatever_comes_in_the_output_never_leaves_range_or_slew(

@@ -127,6 +127,7 @@ fn without_data_collect_records_on_the_rig_and_keeps_what_it_recorded() {
 }
 
 #[test]
+#[ignore = "nightly: 6 s of a debug build; the fast one collects what it lacks without data"]
 fn records_that_leave_two_names_open_are_followed_by_the_experiment_that_decides() {
     let folder = tempfile::tempdir().unwrap();
     let base = Model {

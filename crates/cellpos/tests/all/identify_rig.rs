@@ -123,6 +123,16 @@ fn the_run_of_an_identification_is_kept_with_its_ticks_replays_to_the_bit_and_ha
 
 #[test]
 fn a_camera_later_than_the_rig_file_says_is_measured_and_the_file_is_said_to_be_wrong() {
+    later_than_the_rig_file_says("--frequency 5Hz,10Hz,20Hz,50Hz,120Hz");
+}
+
+#[test]
+#[ignore = "nightly: the lines that a user gets without a choice; the fast one has five"]
+fn a_camera_later_than_the_rig_file_says_is_measured_with_every_line() {
+    later_than_the_rig_file_says("");
+}
+
+fn later_than_the_rig_file_says(lines: &str) {
     let folder = tempfile::tempdir().unwrap();
     // Half the exposure comes on top: 4 ms from its middle to the tick, the file says 2.
     let mut late = cellpos_plant::Model::eq6();
@@ -134,9 +144,10 @@ fn a_camera_later_than_the_rig_file_says_is_measured_and_the_file_is_said_to_be_
         "rig.toml",
         "[emulator]\nideal = true\nseed = 4\nmodel = \"late.toml\"\n",
     );
-    let line =
-        "identify --rig rig.toml --frames off --bootstrap 0 --json --out m.toml --report r.html";
-    let r = succeed(folder.path(), line).json();
+    let line = format!(
+        "identify --rig rig.toml --frames off --bootstrap 0 {lines} --json --out m.toml --report r.html"
+    );
+    let r = succeed(folder.path(), &line).json();
     assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.01, "{r}");
     let delay_ms = number(&r["parameters"]["delay_ms"], "value");
     assert!((delay_ms - 4.0).abs() < 0.05, "{delay_ms}");
@@ -168,7 +179,7 @@ fn a_camera_later_than_the_rig_file_says_is_measured_and_the_file_is_said_to_be_
 const FEW: &str = "--frequency 5Hz,10Hz,20Hz,50Hz,120Hz --bootstrap 0 --led-edges 0 --json --out m.toml --report r.html";
 
 #[test]
-#[ignore = "nightly: 6 s of a debug build; the fast one loses the bead for good and goes on with another"]
+#[ignore = "nightly: 6 s of a debug build; cellpos-workbench goes on with the next bead in the fast one"]
 fn a_segment_in_which_the_bead_was_lost_is_measured_again() {
     let folder = tempfile::tempdir().unwrap();
     rig(
@@ -222,6 +233,7 @@ fn a_run_that_ended_because_the_line_stalled_is_gone_on_with() {
 }
 
 #[test]
+#[ignore = "nightly: 4 s of a debug build; the fast ones go on after a wrong sign, and with the next bead in cellpos-workbench"]
 fn an_identification_goes_on_with_the_bead_that_comes_after_one_that_was_lost_for_good() {
     let folder = tempfile::tempdir().unwrap();
     rig(
@@ -246,6 +258,16 @@ fn an_identification_goes_on_with_the_bead_that_comes_after_one_that_was_lost_fo
 
 #[test]
 fn a_wrong_sign_stops_an_identification_which_keeps_its_segments_and_goes_on_from_them() {
+    stopped_by_a_wrong_sign("off");
+}
+
+#[test]
+#[ignore = "nightly: through frames; the fast one has none"]
+fn a_wrong_sign_stops_an_identification_through_frames_which_goes_on_from_its_segments() {
+    stopped_by_a_wrong_sign("on");
+}
+
+fn stopped_by_a_wrong_sign(frames: &str) {
     let folder = tempfile::tempdir().unwrap();
     rig(
         folder.path(),
@@ -255,7 +277,7 @@ fn a_wrong_sign_stops_an_identification_which_keeps_its_segments_and_goes_on_fro
     rig(folder.path(), "good.toml", "[emulator]\nseed = 2\n");
     let ran = cellpos(
         folder.path(),
-        &format!("identify --rig bad.toml --seed 2 {FEW}"),
+        &format!("identify --rig bad.toml --frames {frames} --seed 2 {FEW}"),
     );
     assert_eq!(ran.code, Some(1), "{}\n{}", ran.out, ran.err);
     let text = message(&ran);
@@ -274,7 +296,7 @@ fn a_wrong_sign_stops_an_identification_which_keeps_its_segments_and_goes_on_fro
     assert!((1..5).contains(&done), "{done}");
     let r = succeed(
         folder.path(),
-        &format!("identify --rig good.toml --resume m.partial.json {FEW}"),
+        &format!("identify --rig good.toml --frames {frames} --resume m.partial.json {FEW}"),
     )
     .json();
     assert!((gain(&r) / TRUE_GAIN_PER_S - 1.0).abs() < 0.02, "{r}");

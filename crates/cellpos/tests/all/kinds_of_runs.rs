@@ -131,8 +131,18 @@ fn compared(at: &Path, kind: &str, run: &Path) {
 
 #[test]
 fn every_kind_of_run_goes_through_every_command_that_reads_one() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = folder.path();
+    // A run of two sessions, one of a cell through frames, and one without an end: what the others lack or have is among it.
+    through_every_command(|kind| ["resumed", "cell", "killed"].contains(&kind));
+}
+
+#[test]
+#[ignore = "nightly: models are fitted to every kind; the fast one fits them to three"]
+fn every_kind_of_run_is_compared_with_a_model() {
+    through_every_command(|_| true);
+}
+
+/// A run of each kind.
+fn one_of_each_kind(at: &Path) -> [(&'static str, PathBuf); 8] {
     script(at);
     let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/cell.toml");
     let learn = "--sine 2um@20Hz --learn --duration 6s --name learned";
@@ -150,7 +160,7 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
     let meta = std::fs::read_to_string(bare.join("run.toml")).unwrap();
     let end = meta.find("[end.summary]").unwrap();
     std::fs::write(bare.join("run.toml"), &meta[..end]).unwrap();
-    let runs = [
+    [
         (
             "track",
             made(at, &format!("track --target 1um --duration 6s {FAST}")),
@@ -180,7 +190,14 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
         ),
         ("killed", cut),
         ("without a summary", bare),
-    ];
+    ]
+}
+
+/// Every kind exported, replayed and reported, and those that are asked for compared with a model.
+fn through_every_command(is_compared: impl Fn(&str) -> bool + Sync) {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let runs = one_of_each_kind(at);
     map(&runs, 2, |(kind, run)| {
         let path = run.display();
         let exported: Value = succeed(at, &format!("export {path} --json")).json();
@@ -214,7 +231,9 @@ fn every_kind_of_run_goes_through_every_command_that_reads_one() {
             at,
             &format!("simulate --model eq6 --input {path} --out {simulated}"),
         );
-        compared(at, kind, run);
+        if is_compared(kind) {
+            compared(at, kind, run);
+        }
     });
     let (_, resumed) = &runs[4];
     let of_sessions = succeed(at, &format!("export {} --force --json", resumed.display())).json();

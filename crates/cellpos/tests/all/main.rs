@@ -26,5 +26,6 @@ mod scripts_resumed;
 mod signals;
 mod terminal;
 mod track;
+mod track_faults;
 mod vision;
 mod wrong_pixel;

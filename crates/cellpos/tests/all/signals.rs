@@ -19,7 +19,7 @@ fn start(folder: &Path, line: &str) -> Child {
 /// Signals are as they are in a terminal, but for HUP as said: the tests themselves may run in the background or under `nohup`, where they
 /// are ignored.
 fn start_with(folder: &Path, line: &str, hang_up: &str) -> Child {
-    Command::new("env")
+    let child = Command::new("env")
         .args(["--default-signal=INT,QUIT", hang_up])
         .arg(env!("CARGO_BIN_EXE_cellpos"))
         .args(line.split_whitespace())
@@ -28,7 +28,21 @@ fn start_with(folder: &Path, line: &str, hang_up: &str) -> Child {
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
-        .unwrap()
+        .unwrap();
+    // Until `env` has done its part a signal that the tests ignore is lost, and the program goes on to its end.
+    while ignores(&child, Signal::INT) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    child
+}
+
+fn ignores(child: &Child, signal: Signal) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", child.id()));
+    let ignored = status.ok().and_then(|text| {
+        let mask = text.lines().find_map(|line| line.strip_prefix("SigIgn:"))?;
+        u64::from_str_radix(mask.trim(), 16).ok()
+    });
+    ignored.is_some_and(|mask| mask >> (signal.as_raw() - 1) & 1 == 1)
 }
 
 fn tell(child: &Child, signal: Signal) {

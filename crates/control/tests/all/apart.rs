@@ -373,6 +373,7 @@ fn a_change_before_a_stall_is_reported_once() {
 }
 
 #[test]
+#[ignore = "nightly: half an hour of a loop, 7 s of a debug build; the fast ones have gains that step and drift"]
 fn a_channel_that_clogs_in_a_quarter_of_an_hour_is_within_the_interval() {
     let clogs = Row {
         halves_s: 900.0,

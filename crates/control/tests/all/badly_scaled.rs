@@ -68,7 +68,8 @@ fn request(plant: DesignPlant, controller: Requested) -> DesignRequest {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
+    // A debug build draws fewer: the nightly run, a release build, draws all, and others each night.
+    #![proptest_config(ProptestConfig { cases: if cfg!(debug_assertions) { 50 } else { 200 }, ..ProptestConfig::default() })]
 
     #[test]
     fn a_badly_scaled_model_ends_in_a_design_or_a_sentence(

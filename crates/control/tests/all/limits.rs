@@ -121,7 +121,8 @@ fn a_first_belief_of_neutral_that_no_actuator_reaches_is_none() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+    // A debug build draws fewer: the nightly run, a release build, draws all, and others each night.
+    #![proptest_config(ProptestConfig { cases: if cfg!(debug_assertions) { 100 } else { 400 }, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn no_command_leaves_range_or_slew_whatever_the_measurements(

@@ -25,7 +25,17 @@ fn three_seconds(world: &mut World) -> Vec<Vec<u8>> {
 /// Of the search that took the wall for a part of the bead, five of these eight records got a window of 37 to 41 px and a tolerance of 0.26.
 #[test]
 fn a_wall_along_which_a_bead_goes_is_no_part_of_the_bead() {
-    for seed in 129_920..129_924 {
+    beside_a_wall(129_920..129_921);
+}
+
+#[test]
+#[ignore = "nightly: four beads; the fast one has the first"]
+fn a_wall_along_which_a_bead_goes_is_part_of_no_bead() {
+    beside_a_wall(129_920..129_924);
+}
+
+fn beside_a_wall(seeds: std::ops::Range<u64>) {
+    for seed in seeds {
         let config = WorldConfig {
             seed,
             bead_look: BeadLook::Ring,

@@ -37,8 +37,11 @@ fn run(records: &[Record]) -> Result<Reconciliation, ReconcileError> {
 }
 
 fn expect(name: &str, ids: &[&str]) -> Reconciliation {
-    let records = case(name);
-    let result = run(&records).unwrap();
+    expect_with(name, ids, &Options::default())
+}
+
+fn expect_with(name: &str, ids: &[&str], options: &Options) -> Reconciliation {
+    let result = reconcile(&Model::eq6(), &case(name), options, &mut |_| {}).unwrap();
     let mut named: Vec<&str> = result.effects.iter().map(|e| e.id.as_str()).collect();
     named.sort_unstable();
     assert_eq!(named, ids, "{name}: {:?}", result.places);
@@ -67,7 +70,12 @@ fn expect(name: &str, ids: &[&str]) -> Reconciliation {
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
 fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
-    let result = expect("time-delay", &["time-delay"]);
+    // One name and no search for a second.
+    let one = Options {
+        max_effects: 1,
+        ..Options::default()
+    };
+    let result = expect_with("time-delay", &["time-delay"], &one);
     let page = report(&result, "labelled").to_html();
     let text = page.split("<body").nth(1).unwrap();
     let order = [
@@ -80,6 +88,12 @@ fn a_time_delay_is_named_and_the_report_says_so_before_anything_else() {
     ];
     let at: Vec<Option<usize>> = order.iter().map(|words| text.find(words)).collect();
     assert!(at.iter().all(Option::is_some) && at.is_sorted(), "{at:?}");
+}
+
+#[test]
+#[ignore = "nightly: a second name is looked for as well; the fast one looks for one"]
+fn a_time_delay_is_named_and_nothing_else() {
+    expect("time-delay", &["time-delay"]);
 }
 
 #[test]
@@ -138,12 +152,16 @@ fn leak_and_hum_together_are_both_named() {
 }
 
 #[test]
-#[ignore = "nightly: the fast ones are the other records that hide nothing"]
+#[ignore = "nightly: the fast ones have records of linear models, and a loop that hides nothing"]
 fn records_that_hide_nothing_get_no_name() {
     expect("none-1", &[]);
 }
 
 #[test]
+#[cfg_attr(
+    not(no_shared_data),
+    ignore = "nightly: 6 s of a debug build; the fast ones have records of linear models, and a loop that hides nothing"
+)]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/hidden-effects")]
 fn other_records_that_hide_nothing_get_no_name_either() {
     expect("none-2", &[]);

@@ -328,6 +328,13 @@ fn every_form_agrees(rows: u64) {
 }
 
 #[test]
+fn every_form_has_all_rows_of_two_short_sessions_with_equal_values() {
+    // More than a batch and a chunk, and no multiple of either. A row group takes more.
+    every_form_agrees(17_001);
+}
+
+#[test]
+#[ignore = "nightly: 7 s of a debug build; the fast one has fewer rows"]
 fn every_form_has_all_rows_of_both_sessions_with_equal_values() {
     // More than a batch, a chunk and a row group, and no multiple of any.
     every_form_agrees(70_001);

@@ -73,7 +73,8 @@ fn kind() -> impl Strategy<Value = ControllerKind> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(1000))]
+    // A debug build draws fewer: the nightly run, a release build, draws all, and others each night.
+    #![proptest_config(ProptestConfig::with_cases(if cfg!(debug_assertions) { 250 } else { 1000 }))]
     #[test]
     fn no_command_leaves_range_or_slew(kind in kind(), ticks in prop::collection::vec(tick(), 100..300)) {
         let file = controller(kind);

@@ -51,9 +51,19 @@ fn overlap(distances: &[f64]) {
 #[test]
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
+    drawn_by_chance(4, 120);
+}
+
+#[test]
+#[ignore = "nightly: more cells and pairs; the fast one has a third of them"]
+fn many_cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
+    drawn_by_chance(8, 400);
+}
+
+fn drawn_by_chance(variants: usize, count: usize) {
     let (mut drawn, mut alone, mut pairs, mut lies) = (0, 0, 0, 0);
     for mut lab in SETS.map(Lab::open) {
-        let (cells, tried) = lab.varied(8);
+        let (cells, tried) = lab.varied(variants);
         println!(
             "{}: {} of {tried} alone are one good cell",
             lab.name,
@@ -62,7 +72,7 @@ fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
         drawn += tried;
         alone += cells.len();
         let mut rows: [Row; 4] = Default::default();
-        for _ in 0..400 {
+        for _ in 0..count {
             let mut one_of = |n: usize| (lab.random.uniform() * n as f64) as usize;
             let (known, other) = (&cells[one_of(cells.len())], &cells[one_of(cells.len())]);
             let apart = 0.35 + lab.random.uniform();
@@ -94,19 +104,13 @@ fn cells_drawn_by_chance_are_found_whole_and_pairs_are_not() {
 #[cfg_attr(no_shared_data, ignore = "needs ../shared/data/cells-in-channels")]
 fn changed_frames() {
     frames_changed_by(&[
-        ("as recorded", 0.0, 0.0, 0.0),
-        ("frame blurred 1", 1.0, 0.0, 0.0),
-        ("frame blurred 2", 2.0, 0.0, 0.0),
         ("frame blurred 4", 4.0, 0.0, 0.0),
-        ("walls moved 3", 0.0, 1.34, 2.68),
-        ("walls moved -3 across", 0.0, 0.0, -3.0),
-        ("walls moved 3 along", 0.0, 3.0, 0.0),
         ("moved 2, blurred 1", 1.0, 0.9, 1.79),
     ]);
 }
 
 #[test]
-#[ignore = "nightly: every row of the table; the fast one has each kind of change, and the largest"]
+#[ignore = "nightly: every row of the table; the fast one has the largest blur, and both together"]
 fn changed_frames_every_row() {
     frames_changed_by(&[
         ("as recorded", 0.0, 0.0, 0.0),

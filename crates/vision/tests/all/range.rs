@@ -66,12 +66,12 @@ fn frame_of(
 
 #[test]
 fn the_tracker_says_that_the_settings_will_not_hold_before_it_loses_the_bead() {
-    // The widest profile takes most of the time: it has the ramp that no other has.
-    ramps(|of, k| [(0, 0), (1, 1), (1, 3), (2, 2)].contains(&(of, k)));
+    // The widest profile takes most of the time, and the narrowest has one ramp: the ring has all of them.
+    ramps(|of, _| of == 1);
 }
 
 #[test]
-#[ignore = "slow: every profile with every ramp; the fast one has each of them"]
+#[ignore = "slow: every profile with every ramp; the fast one has each ramp"]
 fn the_tracker_says_it_of_every_profile_in_every_ramp() {
     ramps(|_, _| true);
 }
@@ -82,6 +82,9 @@ fn ramps(take: impl Fn(usize, usize) -> bool) {
         .into_iter()
         .enumerate()
     {
+        if !(0..4).any(|k| take(of, k)) {
+            continue;
+        }
         let profile = profile.as_ref();
         let mut random = Random(61);
         let scene = Scene::new(profile, SNR, Spoil::Clean, 3);

@@ -183,12 +183,27 @@ fn a_bead_that_a_command_turns_while_it_is_exposed_is_where_it_was_on_average() 
 /// of streak that this comes to is the pair's, not a bead's.
 #[test]
 fn of_two_beads_that_touch_and_move_fast_each_is_localised_at_its_own_bound() {
+    // The speed too low beside the one, right and too high beside the others.
+    touch_and_move_fast(|place, speed| place == speed);
+}
+
+#[test]
+#[ignore = "nightly: each place with each speed; the fast one has each once"]
+fn of_two_beads_that_touch_and_move_fast_each_is_localised_whatever_the_speed_is_taken_for() {
+    touch_and_move_fast(|_, _| true);
+}
+
+fn touch_and_move_fast(take: impl Fn(usize, usize) -> bool) {
     let profile = RingProfile::new(EDGE_PX).unwrap();
     let way = (8.0, 0.0);
     let snr = 40.0;
     println!("apart (px)  expected  error / bound  bias x, y (px)  good");
-    for apart in [(9.0, 4.0), (2.0, 9.0), (11.0, 0.0)] {
-        for known in [0.8, 1.0, 1.2] {
+    let places = [(9.0, 4.0), (2.0, 9.0), (11.0, 0.0)];
+    for (place, apart) in places.into_iter().enumerate() {
+        for (speed, known) in [0.8, 1.0, 1.2].into_iter().enumerate() {
+            if !take(place, speed) {
+                continue;
+            }
             let mut random = Random(7);
             let limit = bound(&profile, way, snr);
             let mut errors = Errors::default();
