@@ -95,8 +95,10 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
             r.bead_um.iter().rposition(seen),
         ) {
             c.rows += last - first + 1;
-            let unseen = |k: usize| r.unseen.get(k).is_some_and(|u| *u);
-            let missing = |k: usize| r.bead_um[k].is_nan() && !unseen(k);
+            // A frame that a stalled machine did not look at may have come.
+            let is = |flags: &[bool], k: usize| flags.get(k).is_some_and(|flag| *flag);
+            let unknown = |k: usize| is(&r.unseen, k) || is(&r.late_command, k);
+            let missing = |k: usize| r.bead_um[k].is_nan() && !unknown(k);
             let lost = (first..=last).filter(|&k| missing(k));
             c.missing += lost.clone().count();
             c.gaps += lost.filter(|&k| !missing(k - 1)).count();
@@ -259,8 +261,14 @@ mod tests {
         assert_eq!((stall.missing, stall.gaps), (40, 1));
         assert!(!stall.drops_named());
         assert!(without(&|k| k % 1000 == 500).drops_named());
-        // Many short bursts are a fault of the camera.
+        // Many short bursts are a fault of the camera, or of a machine that was late then.
         assert!(without(&|k| k % 2000 < 3).drops_named());
+        let mut late = walk(40_000, |_, _| false);
+        late.late_command = (0..40_000).map(|k| k % 2000 < 3).collect();
+        for (bead, late) in late.bead_um.iter_mut().zip(&late.late_command) {
+            *bead = if *late { f64::NAN } else { *bead };
+        }
+        assert_eq!(count(&[late], true).missing, 0);
     }
 
     #[test]
