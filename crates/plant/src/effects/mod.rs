@@ -256,6 +256,13 @@ pub trait EffectKind: fmt::Debug + Send + Sync + AsEffectKind {
         Effect::new(self.as_kind(), form, values, &[])
     }
 
+    /// The band, between multiples of half the frame rate, of a frequency among the values. Frames show a frequency of one band much like
+    /// its image in another, so a fit has a minimum in each. 0 of an effect without a frequency.
+    fn band(&self, values: &[f64], sample_s: f64) -> usize {
+        let _ = (values, sample_s);
+        0
+    }
+
     /// Delay that candidate `index` adds to a slow motion \[s\], if any.
     fn lag_s(&self, index: usize, values: &[f64]) -> Option<f64> {
         let _ = (index, values);

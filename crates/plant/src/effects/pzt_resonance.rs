@@ -55,6 +55,12 @@ impl EffectKind for PztResonance {
         )
     }
 
+    fn band(&self, values: &[f64], sample_s: f64) -> usize {
+        values
+            .first()
+            .map_or(0, |hz| (2.0 * hz * sample_s) as usize)
+    }
+
     fn lag_s(&self, _: usize, values: &[f64]) -> Option<f64> {
         Some(2.0 * values.get(1)? / (TAU * values.first()?))
     }

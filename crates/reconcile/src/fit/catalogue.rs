@@ -146,6 +146,11 @@ impl Part {
         *self = Self::new(self.variant, &self.natural());
     }
 
+    /// The band of its frequency, between multiples of half the frame rate.
+    pub(crate) fn band(&self, sample_s: f64) -> usize {
+        self.variant.kind.band(&self.natural(), sample_s)
+    }
+
     /// The delay of a slow motion by this effect, if it has one \[s\].
     pub(crate) fn lag_s(&self) -> Option<f64> {
         let lag_s = self

@@ -12,7 +12,7 @@ use crate::search::pixel::pixel_scan;
 use crate::search::suspect::{Suspect, lines_score};
 use cellpos_plant::effects::Role;
 
-/// The best start of every variant not excluded, best first.
+/// The best start of every variant not excluded, in each band of its frequency; best first.
 pub(crate) fn screen(
     ctx: &Context<'_>,
     fit: &Fit,
@@ -39,7 +39,8 @@ pub(crate) fn screen(
     });
     let mut best: Vec<Suspect> = Vec::new();
     for (part, score) in jobs.into_iter().zip(scores) {
-        match best.iter_mut().find(|l| l.part.variant == part.variant) {
+        let valley = |part: &Part| (part.variant, part.band(ctx.problem.base.sample_s));
+        match best.iter_mut().find(|l| valley(&l.part) == valley(&part)) {
             Some(lead) if lead.score < score => *lead = Suspect { part, score },
             Some(_) => {}
             None => best.push(Suspect { part, score }),

@@ -52,18 +52,25 @@ pub(crate) fn extensions(
         })
         .map(|l| l.part)
         .collect();
-    // The best form of each effect, and the second best if neither form is a limit of the other.
-    let mut seen: Vec<&str> = Vec::new();
+    // The best form of each effect in each band of its frequency, and the second best if neither form is a limit of the other.
+    let mut seen: Vec<(&str, usize)> = Vec::new();
     let worth = worth.into_iter().filter(|part| {
-        let id = part.id();
-        let before = seen.iter().filter(|s| **s == id).count();
+        let valley = (part.id(), part.band(ctx.problem.base.sample_s));
+        let before = seen.iter().filter(|s| **s == valley).count();
         let new = before < part.variant.forms_worth_following();
         if new {
-            seen.push(id);
+            seen.push(valley);
         }
         new
     });
-    let worth: Vec<Part> = worth.take(wide).collect();
+    let mut ids: Vec<&str> = Vec::new();
+    let is_wide = |part: &Part| {
+        if ids.len() < wide && !ids.contains(&part.id()) {
+            ids.push(part.id());
+        }
+        ids.contains(&part.id())
+    };
+    let worth: Vec<Part> = worth.filter(is_wide).collect();
     // A short fit of all, then the best few to the end.
     let mut fits = cellpos_numeric::parallel::map(&worth, effort.threads, |part| {
         let mut parts = fit.parts.clone();
