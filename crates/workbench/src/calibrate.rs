@@ -11,13 +11,12 @@ use crate::bench::Bench;
 use crate::mover::{Mover, stopped};
 use crate::rig_text::change;
 use crate::watch::{Sighting, Watch};
-use cellpos_drivers::{Axis, CalibrationFile};
 use cellpos_plant::{Hertz, TransferFunction};
 use cellpos_rig::Clock;
 use cellpos_runtime::realtime;
 use cellpos_session::{Failure, signals};
+pub use fit::Response;
 use fit::fit;
-use serde::Serialize;
 use std::f64::consts::TAU;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -59,67 +58,6 @@ impl Pulses {
             power += 1.0 / (n * n);
         }
         gain / power
-    }
-}
-
-/// What the pulses showed.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Response {
-    /// Bead velocity per displacement of the PZT along columns' and rows' numbers, px/s per um.
-    pub gain_px_per_s: [f64; 2],
-    /// Its standard deviation, per axis.
-    pub sd_px_per_s: f64,
-    /// Delay from a command to its motion in the frames, ms.
-    pub lag_ms: f64,
-    /// Frames used.
-    pub frames: usize,
-    /// Size of the frames, px.
-    pub size_px: [usize; 2],
-}
-
-impl Response {
-    /// Length of the gain vector, px/s per um.
-    pub fn gain(&self) -> f64 {
-        self.gain_px_per_s[0].hypot(self.gain_px_per_s[1])
-    }
-
-    /// Axis, sign, tilt (degrees) and the tilt's standard deviation.
-    pub fn direction(&self) -> (Axis, i8, f64, f64) {
-        let [x, y] = self.gain_px_per_s;
-        let (axis, along, other) = if x.abs() >= y.abs() {
-            (Axis::X, x, y)
-        } else {
-            (Axis::Y, y, x)
-        };
-        let sign = if along < 0.0 { -1 } else { 1 };
-        let tilt_deg = (other / along).atan().to_degrees();
-        let sd_deg = (self.sd_px_per_s / self.gain()).to_degrees();
-        (axis, sign, tilt_deg, sd_deg)
-    }
-
-    /// The calibration, with a pixel size from elsewhere. A tilt below two of its standard deviations counts as zero.
-    pub fn calibration(&self, pixel_um: f64, pixel_um_sd: f64, method: String) -> CalibrationFile {
-        let (axis, sign, tilt_deg, sd_deg) = self.direction();
-        let [width, height] = self.size_px.map(|px| px.saturating_sub(1) as f64);
-        let (origin_px, across_px) = match axis {
-            Axis::X => (0.5 * width, 0.5 * height),
-            Axis::Y => (0.5 * height, 0.5 * width),
-        };
-        CalibrationFile {
-            pixel_um,
-            pixel_um_sd,
-            axis,
-            sign,
-            origin_px,
-            tilt_deg: if tilt_deg.abs() > 2.0 * sd_deg {
-                tilt_deg
-            } else {
-                0.0
-            },
-            origin_across_px: across_px,
-            date: jiff::Timestamp::now().strftime("%Y-%m-%d").to_string(),
-            method,
-        }
     }
 }
 
@@ -304,6 +242,34 @@ pub fn name_in_rig(rig: &Path, calibration: &Path) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_gain_of_a_plant_is_that_which_its_pulses_show() {
+        // The paper's plant, integrated in steps of 0.1 ms, frames each ms.
+        let plant = TransferFunction::eq6();
+        let pulses = Pulses::default();
+        let (k, b1, b0, a1, a0) = (0.01872, 20_261.5, 1_745_041.0, 76.3, 0.13);
+        let (mut state, mut commands, mut sightings) = ([0.0_f64; 2], Vec::new(), Vec::new());
+        for ms in 0..2 * pulses.length_ms * pulses.pairs {
+            let is_up = ((ms + pulses.length_ms / 2) / pulses.length_ms).is_multiple_of(2);
+            let u = if is_up { 0.2 } else { -0.2 };
+            let at_ns = i64::from(ms) * 1_000_000;
+            commands.push((at_ns, u));
+            let um = k * ((b0 - a0) * state[0] + (b1 - a1) * state[1] + u);
+            sightings.push(Sighting {
+                at_ns,
+                x_px: 10.0 * um,
+                y_px: 0.0,
+            });
+            for _ in 0..10 {
+                let slope = [state[1], u - a1 * state[1] - a0 * state[0]];
+                state = [0, 1].map(|i| state[i] + 1e-4 * slope[i]);
+            }
+        }
+        let shown = fit(&commands, &sightings, [256, 64]).expect("enough frames");
+        let ratio = shown.gain() / 10.0 / pulses.velocity_gain_per_s(&plant);
+        assert!((ratio - 1.0).abs() < 0.01, "{ratio}");
+    }
 
     #[test]
     fn a_stop_after_the_last_pulse_is_an_end_as_one_before_it() {
