@@ -188,22 +188,27 @@ impl Context<'_> {
             };
             let before = state.chi2;
             let mut trials = FIRST_TRIALS;
-            for _ in 0..=self.simulations_of_columns(&fit) {
+            let most_corrections = self.simulations_of_columns(&fit);
+            for correction in 0..=most_corrections {
                 let Some((next, next_state)) =
                     self.step_down((&fit, &state), &linear, &mut lambda, trials, mask)
                 else {
                     break;
                 };
-                let improved = state.chi2 - next_state.chi2;
-                let moved = self.numbers(&next) - self.numbers(&fit);
-                linear::correct(
-                    &mut columns,
-                    &moved,
-                    &linear.normal,
-                    [&state.innovations, &next_state.innovations],
-                );
+                let last = state.chi2 - next_state.chi2 < least(&next_state)
+                    || correction == most_corrections;
+                if !last {
+                    let moved = self.numbers(&next) - self.numbers(&fit);
+                    let change = [&state.innovations, &next_state.innovations];
+                    linear::correct(
+                        &mut columns,
+                        &moved,
+                        &linear.normal,
+                        change.map(Vec::as_slice),
+                    );
+                }
                 (fit, state) = (next, next_state);
-                if improved < least(&state) {
+                if last {
                     break;
                 }
                 linear = self.linear(&fit, &state, (n, &columns), mask, still);

@@ -22,6 +22,13 @@ pub(crate) struct Linear {
     gradient: DVector<f64>,
 }
 
+/// Takes a number out of normal equations: a step leaves it where it is.
+fn hold(normal: &mut DMatrix<f64>, gradient: &mut DVector<f64>, number: usize) {
+    normal.row_mut(number).fill(0.0);
+    normal.column_mut(number).fill(0.0);
+    gradient[number] = 0.0;
+}
+
 impl Context<'_> {
     /// The normal equations at a state, with what holds a number in its place.
     pub(crate) fn linear(
@@ -45,9 +52,7 @@ impl Context<'_> {
             at += freedom_of(p.variant(), self.problem.records.len());
         }
         if let Some(still) = still {
-            held.row_mut(still).fill(0.0);
-            held.column_mut(still).fill(0.0);
-            gradient[still] = 0.0;
+            hold(&mut held, &mut gradient, still);
         }
         Linear {
             normal,
@@ -104,11 +109,8 @@ impl Context<'_> {
             let Some(stuck) = (0..step.len()).find(|&i| stuck(i)) else {
                 return Some(trial);
             };
-            let own = held[(stuck, stuck)];
-            held.row_mut(stuck).fill(0.0);
-            held.column_mut(stuck).fill(0.0);
-            held[(stuck, stuck)] = own;
-            gradient[stuck] = 0.0;
+            hold(&mut held, &mut gradient, stuck);
+            held[(stuck, stuck)] = 1.0;
         }
     }
 
