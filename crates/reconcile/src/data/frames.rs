@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 /// What was counted.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct FrameCounts {
+    /// Rows that no stall of the machine leaves in doubt, and how many of them are without a frame.
     pub rows: usize,
     pub missing: usize,
     /// Runs of missing frames. A camera or a line that stalls once loses many frames in one run.
@@ -35,6 +36,52 @@ impl FrameCounts {
 
     pub(crate) fn repeat_rate(&self) -> f64 {
         ((self.repeats as f64 - self.by_chance) / self.pairs.max(1) as f64).max(0.0)
+    }
+
+    /// Counts the missing frames of a record. A stall of the machine leaves rows in doubt and loses the frames beside them. A camera
+    /// loses frames everywhere alike, so that rows that are not beside a stall tell its rate.
+    fn count_missing(&mut self, r: &Record) {
+        #[derive(Clone, Copy, PartialEq)]
+        enum Row {
+            Seen,
+            Missing,
+            InDoubt,
+        }
+        let is = |flags: &[bool], k: usize| flags.get(k).is_some_and(|flag| *flag);
+        let mut rows: Vec<Row> = (0..r.rows())
+            .map(|k| match r.bead_um[k].is_nan() {
+                _ if is(&r.unseen, k) || is(&r.late_command, k) => Row::InDoubt,
+                true => Row::Missing,
+                false => Row::Seen,
+            })
+            .collect();
+        // Rows before the first bead and after the last say nothing of the camera.
+        let seen = |b: &f64| b.is_finite();
+        let first = r.bead_um.iter().position(seen).unwrap_or(rows.len());
+        rows.truncate(r.bead_um.iter().rposition(seen).map_or(0, |last| last + 1));
+        let runs: Vec<&[Row]> = rows
+            .get(first..)
+            .unwrap_or(&[])
+            .chunk_by(|a, b| a == b)
+            .collect();
+        for (i, run) in runs.iter().enumerate() {
+            let in_doubt = |j: Option<usize>| {
+                (j.and_then(|j| runs.get(j))).is_some_and(|run| run[0] == Row::InDoubt)
+            };
+            let beside = [i.checked_sub(1), Some(i + 1)].map(in_doubt);
+            match run[0] {
+                Row::Seen => {
+                    let left_out = beside.iter().filter(|beside| **beside).count();
+                    self.rows += run.len().saturating_sub(left_out);
+                }
+                Row::Missing if !beside.contains(&true) => {
+                    self.rows += run.len();
+                    self.missing += run.len();
+                    self.gaps += 1;
+                }
+                Row::Missing | Row::InDoubt => {}
+            }
+        }
     }
 
     /// More losses than a start-up glitch and a stall. The effect loses each frame by itself, so what counts is how often, not how many.
@@ -88,21 +135,7 @@ pub(crate) fn count(records: &[Record], of_camera: bool) -> FrameCounts {
     let mut distances: BTreeMap<usize, usize> = BTreeMap::new();
     for r in records {
         let n = r.rows();
-        // Rows before the first bead and after the last say nothing of the camera.
-        let seen = |b: &f64| b.is_finite();
-        if let (Some(first), Some(last)) = (
-            r.bead_um.iter().position(seen),
-            r.bead_um.iter().rposition(seen),
-        ) {
-            c.rows += last - first + 1;
-            // A frame that a stalled machine did not look at may have come.
-            let is = |flags: &[bool], k: usize| flags.get(k).is_some_and(|flag| *flag);
-            let unknown = |k: usize| is(&r.unseen, k) || is(&r.late_command, k);
-            let missing = |k: usize| r.bead_um[k].is_nan() && !unknown(k);
-            let lost = (first..=last).filter(|&k| missing(k));
-            c.missing += lost.clone().count();
-            c.gaps += lost.filter(|&k| !missing(k - 1)).count();
-        }
+        c.count_missing(r);
         let mut repeated = vec![false; n];
         let steps = Steps::of(r);
         let mut near = 0usize;
@@ -263,12 +296,24 @@ mod tests {
         assert!(without(&|k| k % 1000 == 500).drops_named());
         // Many short bursts are a fault of the camera, or of a machine that was late then.
         assert!(without(&|k| k % 2000 < 3).drops_named());
-        let mut late = walk(40_000, |_, _| false);
-        late.late_command = (0..40_000).map(|k| k % 2000 < 3).collect();
-        for (bead, late) in late.bead_um.iter_mut().zip(&late.late_command) {
-            *bead = if *late { f64::NAN } else { *bead };
+        // A machine that stalls: late commands, frames that come too late, and frames that are lost before and after.
+        let mut stalls = walk(40_000, |_, _| false);
+        let place = |k: usize| k % 2000;
+        stalls.late_command = (0..40_000).map(|k| place(k) == 2).collect();
+        stalls.unseen = (0..40_000).map(|k| place(k) == 3).collect();
+        let mut both = stalls.clone();
+        for k in 0..40_000 {
+            if place(k) < 6 {
+                stalls.bead_um[k] = f64::NAN;
+            }
+            if place(k) < 6 || place(k) == 1000 {
+                both.bead_um[k] = f64::NAN;
+            }
         }
-        assert_eq!(count(&[late], true).missing, 0);
+        assert_eq!(count(&[stalls], true).missing, 0);
+        let both = count(&[both], true);
+        assert_eq!((both.missing, both.gaps), (20, 20));
+        assert!(both.drops_named());
     }
 
     #[test]

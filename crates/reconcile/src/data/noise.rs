@@ -64,9 +64,11 @@ impl NoiseModel {
         }
     }
 
-    /// The same with at least so much white noise \[um^2\]; increments have the variance that they had.
-    pub fn at_least(self, white_um2: f64) -> Self {
-        let more = (white_um2 - self.white_um2).max(0.0);
+    /// The same with at least so much localisation noise \[um^2\]; increments have the variance that they had. The exposure may lower
+    /// the white part, as [`Self::from_increments`] says.
+    pub fn at_least(self, localisation_um2: f64) -> Self {
+        let least_um2 = localisation_um2 - self.walk_um2 / 6.0;
+        let more = (least_um2 - self.white_um2).max(0.0);
         Self {
             walk_um2: (self.walk_um2 - 2.0 * more).max(0.0),
             white_um2: self.white_um2 + more,

@@ -74,7 +74,8 @@ pub(crate) fn sample(
         y.extend(t.pos.iter().step_by(fine));
         return;
     }
-    let path = Path::new(t, h, exposure > 0.0);
+    let known = sampling.exposure_s;
+    let path = Path::new(t, h, exposure > 0.0 || known > 0.0);
     let sample_s = h * fine as f64;
     // A frame that close behind an edge shows the share of the edge, as one that close in front of it does. Otherwise a delay of
     // whole frames would be a cliff, and a fit on top of it takes no step.
@@ -83,14 +84,15 @@ pub(crate) fn sample(
     for k in 0..rows {
         let wait = sampling.waits_s.get(k).copied().unwrap_or(0.0);
         let at = k as f64 * sample_s * (1.0 + skew) - delay - wait;
-        let seen = |at: f64| match exposure > 0.0 {
-            true => (path.integral(at) - path.integral(at - exposure)) / exposure,
-            false => path.position(at),
-        };
-        y.push(if sampling.exposure_s > 0.0 {
-            // Two points by Gauss: within 0.2 % of the mean up to half the rate, for an exposure of half a frame.
-            let apart = sampling.exposure_s / 12f64.sqrt();
-            0.5 * (seen(at - apart) + seen(at + apart))
+        // A held command bends the path within an exposure, so points of it would not do for its mean.
+        let seen = |at: f64| path.mean(at - exposure, at);
+        y.push(if known > 0.0 && exposure == 0.0 {
+            path.mean(at - 0.5 * known, at + 0.5 * known)
+        } else if known > 0.0 {
+            // Without bends by the inner mean: two points by Gauss in each half.
+            let near = known * (0.25 - 0.25 / 3f64.sqrt());
+            let far = known * (0.25 + 0.25 / 3f64.sqrt());
+            0.25 * (seen(at - far) + seen(at - near) + seen(at + near) + seen(at + far))
         } else if exposure > 0.0 {
             seen(at)
         } else {
@@ -178,6 +180,11 @@ impl<'a> Path<'a> {
         let f = upto / self.h;
         let c = self.cubic(j);
         self.h * f * (c[0] + f * (c[1] / 2.0 + f * (c[2] / 3.0 + f * c[3] / 4.0)))
+    }
+
+    /// Mean between two instants.
+    fn mean(&self, from: f64, to: f64) -> f64 {
+        (self.integral(to) - self.integral(from)) / (to - from)
     }
 
     #[inline]

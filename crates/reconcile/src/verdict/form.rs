@@ -330,6 +330,8 @@ fn let_go(
         slope.iter().enumerate().map(|(k, s)| s * f(k)).collect()
     };
     let speed = |x: &[f64], k: usize| x[k] - x[k.saturating_sub(1)];
+    // In a closed loop a row's command answers the row's own innovation; the command before it does not.
+    let command = |k: usize| u[k.saturating_sub(1)];
     let acts = |f: &dyn Fn(usize) -> f64| -> Vec<f64> {
         let mut sum = 0.0;
         (0..slope.len())
@@ -340,17 +342,17 @@ fn let_go(
             .collect()
     };
     let mut out = vec![
-        with(&|k| u[k]),
-        with(&|k| u[k].abs()),
-        with(&|k| u[k] * u[k]),
+        with(&command),
+        with(&|k| command(k).abs()),
+        with(&|k| command(k) * command(k)),
         with(&|k| y[k]),
         with(&|k| y[k].abs()),
         with(&|k| y[k] * y[k]),
         with(&|k| speed(y, k).abs()),
         with(&|k| k as f64 * dt),
-        acts(&|k| u[k]),
-        acts(&|k| u[k].abs()),
-        acts(&|k| u[k] * u[k]),
+        acts(&command),
+        acts(&|k| command(k).abs()),
+        acts(&|k| command(k) * command(k)),
         acts(&|k| speed(y, k).abs()),
     ];
     let slowest = 10.0 * memory_rows;
