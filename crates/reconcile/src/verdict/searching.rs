@@ -16,7 +16,7 @@ use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
 use crate::verdict::late_frames::LateFrames;
 use crate::verdict::wandering::{Wandering, prior_of, suspected};
-use cellpos_plant::effects::Scope;
+use cellpos_plant::effects::{Action, Place, Scope};
 use cellpos_plant::{Effect, Model};
 
 /// In twice the log-likelihood: another estimate of the zero flow changes nothing that decides.
@@ -286,9 +286,13 @@ impl Searching<'_> {
             if moving.found.cut_short {
                 return moving;
             }
-            let mut weighed = self.with_zero_flow(&moving.problem, &moving.found.fit);
+            let mut weighed =
+                self.with_zero_flow(&moving.problem, &moving.found.fit, f64::INFINITY);
             if let Some(exchanged) = self.weigh_rivals(&mut moving, &weighed) {
                 weighed = exchanged;
+            }
+            if let Some(smaller) = self.weigh_smaller(&weighed) {
+                weighed = smaller;
             }
             if weighed.cost > self.cost(&moving.problem, &moving.found.fit) - SETTLED {
                 break;
@@ -350,7 +354,7 @@ impl Searching<'_> {
                 parts[place] = rival.part.clone();
                 let ctx = self.context(problem, 0);
                 let fit = ctx.fit_from(parts, Some(found.fit.soft), &problem.all(), 8);
-                let weighed = self.with_zero_flow(problem, &fit);
+                let weighed = self.with_zero_flow(problem, &fit, f64::INFINITY);
                 rival.chi2 = found.fit.chi2 + unpriced(&weighed) - here;
                 rival.part = weighed.fit.parts[place].clone();
                 if weighed.cost < best.as_ref().unwrap_or(own).cost {
@@ -361,10 +365,33 @@ impl Searching<'_> {
         best
     }
 
+    /// Weighs a set without each of its parts, each under the noise that it leaves itself, if the flow does not pass the chip linearly. There
+    /// a zero flow in the noise is no zero flow, and a part may stand for the path of one. The best set that is more probable.
+    fn weigh_smaller(&self, own: &Weighed) -> Option<Weighed> {
+        let bends = |e: &Effect| {
+            let in_chip = matches!(e.kind().spec().place, Place::Chip | Place::Bead);
+            in_chip && matches!(e.act(), Action::Block(_))
+        };
+        let parts = &own.fit.parts;
+        if parts.len() < 2 || !self.effects(&own.fit).iter().any(bends) {
+            return None;
+        }
+        let without = (0..parts.len()).map(|i| {
+            let mut parts = parts.clone();
+            parts.remove(i);
+            let ctx = self.context(&own.problem, 0);
+            let fit = ctx.fit_from(parts, Some(own.fit.soft), &own.problem.all(), 8);
+            self.with_zero_flow(&own.problem, &fit, own.cost)
+        });
+        without
+            .min_by(|a, b| a.cost.total_cmp(&b.cost))
+            .filter(|best| best.cost < own.cost)
+    }
+
     /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow. The model's
-    /// stated error acts beside the set.
-    fn with_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
-        /// A path gains half as much as the previous one.
+    /// stated error acts beside the set. What cannot become cheaper than `to_beat` is not followed to the end.
+    fn with_zero_flow(&self, problem: &Problem, fit: &Fit, to_beat: f64) -> Weighed {
+        /// A path gains half as much as the previous one: all that follow gain as much as it.
         const MOST_PATHS: usize = 12;
         let residual = |problem: &Problem, fit: &Fit| self.context(problem, 0).residual(fit).0;
         let weighed = |problem: Problem, fit: &Fit| {
@@ -395,10 +422,14 @@ impl Searching<'_> {
         for _ in 0..MOST_PATHS {
             let left = residual(&best.problem, &best.fit);
             let next = weighed(best.problem.clone().with_flow(&left), &best.fit);
-            if next.cost > best.cost - SETTLED {
+            let gained = best.cost - next.cost;
+            if gained < SETTLED {
                 break;
             }
             best = next;
+            if best.cost - gained > to_beat {
+                break;
+            }
         }
         best
     }
