@@ -122,3 +122,22 @@ impl NoiseModel {
         (-0.5 * self.position_um2() * (std::f64::consts::TAU / pixel_um).powi(2)).exp()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_finest_step_of_the_file_leaves_the_white_noise_that_an_exposure_took_away() {
+        // A walk whose camera averages over half of each row: 1/12 of it is missing in the white noise.
+        let noise = NoiseModel::from_increments(1.0 - 2.0 / 12.0, 1.0 / 12.0);
+        assert_eq!(noise.at_least(0.0), noise);
+        assert_eq!(noise.at_least(1e-6), noise);
+        // A step that is coarse for this walk shows all the same.
+        let coarse = noise.at_least(1.0);
+        assert!((coarse.white_um2 - (1.0 - noise.walk_um2 / 6.0)).abs() < 1e-12);
+        let variance = |n: &NoiseModel| n.walk_um2 + 2.0 * n.white_um2;
+        let small = noise.at_least(0.1);
+        assert!((variance(&small) - variance(&noise)).abs() < 1e-12);
+    }
+}

@@ -196,3 +196,38 @@ impl<'a> Path<'a> {
         self.area[j] + self.partial_area(j, f.min(1.5) * self.h)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_exposure_that_straddles_a_bend_shows_the_mean_of_the_path() {
+        // At rest up to row 4, then 2 um in each row: the mean over half a row about the bend is 2 um times 1/2 (1/4)^2/(1/2) rows.
+        let rows = 8;
+        let slope: Vec<f64> = (0..rows).map(|k| if k < 4 { 0.0 } else { 2.0 }).collect();
+        let path = Trace {
+            pos: (0..rows).map(|k| 2.0 * (k as f64 - 4.0).max(0.0)).collect(),
+            jump: vec![0.0; rows],
+            start_slope: slope.clone(),
+            end_slope: slope,
+        };
+        let sampling = Sampling {
+            exposure_s: 0.5,
+            waits_s: Vec::new(),
+        };
+        let mut y = Vec::new();
+        let mut at_bend = |frames: Frames| {
+            sample(&path, (frames, &sampling), 1.0, 1, rows, &mut y);
+            y[4]
+        };
+        let shown = at_bend(Frames::default());
+        assert!((shown - 0.125).abs() < 1e-12, "{shown}");
+        // With an averaging that is short beside it, the same to a part of that.
+        let averaged = at_bend(Frames {
+            exposure_s: 1e-3,
+            ..Frames::default()
+        });
+        assert!((averaged - 0.125).abs() < 2e-3, "{averaged}");
+    }
+}

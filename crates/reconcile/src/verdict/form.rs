@@ -268,7 +268,12 @@ fn freer(ctx: &Context<'_>, fit: &Fit, parts: &[usize]) -> Vec<Vec<Vec<f64>>> {
                     let mut raw = vec![rows.clone().map(|n| a[n] + b[n] - 2.0 * c[n]).collect()];
                     if spread == SPREAD[0] {
                         let slope: Vec<f64> = rows.map(|n| a[n] - b[n]).collect();
-                        raw.extend(let_go(ctx, &slope, &r.u, c, memory_rows));
+                        raw.extend(let_go(
+                            &slope,
+                            &r.u,
+                            c,
+                            (memory_rows, ctx.problem.base.sample_s),
+                        ));
                     }
                     out[i].extend(raw.iter().map(|raw: &Vec<f64>| r.whitened(raw)));
                 }
@@ -318,14 +323,7 @@ fn bends(ctx: &Context<'_>, fit: &Fit, knots: &[f64]) -> Vec<Vec<Vec<f64>>> {
 }
 
 /// A change by a number, as it would be if the number went with command, position, speed or time, or its effect came later.
-fn let_go(
-    ctx: &Context<'_>,
-    slope: &[f64],
-    u: &[f64],
-    y: &[f64],
-    memory_rows: f64,
-) -> Vec<Vec<f64>> {
-    let dt = ctx.problem.base.sample_s;
+fn let_go(slope: &[f64], u: &[f64], y: &[f64], (memory_rows, dt): (f64, f64)) -> Vec<Vec<f64>> {
     let with = |f: &dyn Fn(usize) -> f64| -> Vec<f64> {
         slope.iter().enumerate().map(|(k, s)| s * f(k)).collect()
     };
@@ -403,4 +401,26 @@ fn gain_of(columns: &[Columns], e: &[Vec<f64>]) -> f64 {
     });
     let g = DVector::from_fn(n, |i, _| g[i] * size[i]);
     scaled.cholesky().map_or(0.0, |c| g.dot(&c.solve(&g)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn freer_forms_say_nothing_of_a_row_by_the_command_that_answers_it() {
+        let rows = 40;
+        let slope: Vec<f64> = (0..rows).map(|k| (0.9 * f64::from(k)).sin()).collect();
+        let y: Vec<f64> = (0..rows).map(|k| (0.3 * f64::from(k)).cos()).collect();
+        let before: Vec<f64> = (0..rows).map(|k| (1.7 * f64::from(k)).sin()).collect();
+        let mut after = before.clone();
+        after[20] += 1.0;
+        let of = |u: &[f64]| let_go(&slope, u, &y, (2.0, 1e-3));
+        let mut moved = false;
+        for (a, b) in of(&before).iter().zip(&of(&after)) {
+            assert_eq!(a[..=20], b[..=20]);
+            moved |= a[21..] != b[21..];
+        }
+        assert!(moved);
+    }
 }
