@@ -9,6 +9,7 @@
 //! - [`frequency_response`], [`tone_fit`], [`spectral`]: gain and phase with standard deviations.
 //! - [`delay`]: the camera's delay from the edges of an LED.
 //! - [`rational`], [`from_response`], [`sampled`]: fits of a transfer function. [`base`]: a stated form, such as `order=2,delay`.
+//! - [`late_commands`]: positions as they would be if every command had come on time.
 //! - [`analogue`]: an input that is not held between its samples.
 //! - [`order_selection`]: how many poles the data support. [`identifiability`]: which parameters they determine.
 //! - [`summary`]: the result, ready for a model file.
@@ -43,6 +44,7 @@ pub mod frequency_response;
 pub mod from_response;
 pub mod identifiability;
 mod identified_parameter;
+pub mod late_commands;
 pub mod least_squares;
 pub mod noise;
 pub mod order_selection;

@@ -1,10 +1,9 @@
 //! The ticks of a run as an evenly sampled record, and the segments in it.
 
 use crate::experiment::exciting::SETTLE_TICKS;
-use crate::experiment::lateness::{
-    HandedOver, age_ns, as_if_on_time, is_new_frame, lateness_ns, median, with_new_frame,
-};
+use crate::experiment::lateness::{age_ns, is_new_frame, lateness_ns, median, with_new_frame};
 use cellpos_ident::experiment::{RecordedSegment, Span};
+use cellpos_ident::late_commands::{HandedOver, as_if_on_time};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
 use cellpos_vision::Decision;
 

@@ -1,0 +1,357 @@
+//! Commands that were handed over late: the positions as they would be if every command had been on time.
+//!
+//! A command that is late by part of a row moves the bead less by that part of its step, for good. The rows themselves tell the gain and the
+//! delay with which commands move the bead, so nothing has to be known of the rig. Moving the commands within the band of the rows instead
+//! would be wrong where lateness follows the excitation: steps hold frequencies beyond that band. What a resonance or a lag adds is slower
+//! than a row, and follows from the rows too.
+
+use nalgebra::{DMatrix, DVector};
+
+/// Upper limit of the delay from a command to its effect, in periods: at 1 kHz over USB or a serial line, with the lateness of a tick
+/// included.
+const LINE_PERIODS: f64 = 1.0;
+
+/// Rows in which the chip's response to a command comes to its end: a resonance of 250 Hz rings for 25 ms.
+const MEMORY: usize = 40;
+
+/// Rows at most from which that response is found.
+const ROWS: usize = 8000;
+
+/// Part of the squares that a motion leaves which a response must explain. A smaller one changes what is missing of late commands by less
+/// than the noise, and stalls leave as much.
+const LEAST_SHARE: f64 = 0.1;
+
+/// A bead whose speed goes with the command, some time later.
+#[derive(Debug, Clone, Copy)]
+struct Motion {
+    /// Motion in a row over the command.
+    gain: f64,
+    /// From a row's command to the first motion, in rows.
+    delay: f64,
+}
+
+impl Motion {
+    /// The motion that fits best to rows whose commands were on time and whose frames are so many rows old. `None` if the commands do not
+    /// vary, or too few rows are left.
+    fn of(command_um: &[f64], position_um: &[f64], late: &[bool], age: f64) -> Option<Self> {
+        /// Delays are tried in steps of this part of a row.
+        const STEP: f64 = 0.01;
+        let reach = (age + LINE_PERIODS) as usize + 1;
+        let increments: Vec<(usize, f64)> = (reach..position_um.len().saturating_sub(1))
+            .filter(|&row| !late[row - reach..=row].contains(&true))
+            .map(|row| (row, position_um[row + 1] - position_um[row]))
+            .filter(|(_, um)| um.is_finite())
+            .collect();
+        let rows = increments.len() as f64;
+        let y: f64 = increments.iter().map(|(_, um)| um).sum();
+        let yy: f64 = increments.iter().map(|(_, um)| um * um).sum();
+        // A delay between two rows mixes their commands, so that the sums of all delays follow from those of the rows.
+        let sums = |whole: usize| {
+            let mut sums = [0.0; 7];
+            for &(row, um) in &increments {
+                let (a, b) = (command_um[row - whole], command_um[row - whole - 1]);
+                let parts = [a, b, a * a, a * b, b * b, a * um, b * um];
+                sums.iter_mut()
+                    .zip(parts)
+                    .for_each(|(sum, part)| *sum += part);
+            }
+            sums
+        };
+        let mut of_rows = (usize::MAX, [0.0; 7]);
+        let of_delay = |delay: f64| {
+            let (whole, p) = (delay.floor() as usize, delay.fract());
+            if of_rows.0 != whole {
+                of_rows = (whole, sums(whole));
+            }
+            let ([a, b, aa, ab, bb, ay, by], q) = (of_rows.1, 1.0 - p);
+            let u = q * a + p * b;
+            let variance = q * q * aa + 2.0 * p * q * ab + p * p * bb - u * u / rows;
+            let shared = q * ay + p * by - u * y / rows;
+            let gain = shared / variance;
+            (Self { gain, delay }, yy - y * y / rows - gain * shared)
+        };
+        (0..)
+            .map(|i| age + STEP * f64::from(i))
+            .take_while(|delay| *delay < age + LINE_PERIODS)
+            .map(of_delay)
+            .filter(|(motion, left)| motion.gain.is_finite() && left.is_finite())
+            .min_by(|(_, left), (_, other)| left.total_cmp(other))
+            .map(|(motion, _)| motion)
+    }
+
+    /// How far the bead would be farther in each row if the command of each row had been handed over with the row, um.
+    fn missing_um(&self, command_um: &[f64], handed_over: &[HandedOver]) -> Vec<f64> {
+        let [due, came] = integrals(command_um, handed_over, |row| row - self.delay);
+        (due.iter().zip(came))
+            .map(|(due, came)| self.gain * (due - came))
+            .collect()
+    }
+
+    /// The position if the command of each row had been handed over with the row, um.
+    fn position_um(&self, command_um: &[f64]) -> Vec<f64> {
+        let [due, _] = integrals(command_um, &[], |row| row - self.delay);
+        due.iter().map(|um| self.gain * um).collect()
+    }
+}
+
+/// The integrals of the commands if each had been handed over with its row, and as they were, up to an instant of each row.
+fn integrals(
+    command_um: &[f64],
+    handed_over: &[HandedOver],
+    at: impl Fn(f64) -> f64,
+) -> [Vec<f64>; 2] {
+    let on_time = |(row, um): (usize, &f64)| HandedOver {
+        row: row as f64,
+        um: *um,
+    };
+    let mut due = Integral::of(command_um.iter().enumerate().map(on_time));
+    let mut came = Integral::of(handed_over.iter().copied());
+    let rows = || (0..command_um.len()).map(|row| at(row as f64));
+    [
+        rows().map(|row| due.until(row)).collect(),
+        rows().map(|row| came.until(row)).collect(),
+    ]
+}
+
+/// The response to a step of the command beyond [`Motion`], of a resonance, a lag or a relaxation: after each row, in um per um.
+struct Ringing(Vec<f64>);
+
+impl Ringing {
+    /// By the increments that a motion leaves. Each of them is as large as the gain of the motion before the rows are seen.
+    fn of(motion: Motion, command_um: &[f64], left_um: &[f64], late: &[bool]) -> Option<Self> {
+        let rows: Vec<usize> = (MEMORY..left_um.len().saturating_sub(1))
+            .filter(|&row| !late[row + 1 - MEMORY..=row].contains(&true))
+            .filter(|&row| (left_um[row + 1] - left_um[row]).is_finite())
+            .collect();
+        // So many rows tell forty values well enough.
+        let rows: Vec<usize> = rows
+            .iter()
+            .copied()
+            .step_by(1 + rows.len() / ROWS)
+            .collect();
+        let count = rows.len().max(1) as f64;
+        let mut commands = DMatrix::from_fn(rows.len(), MEMORY, |k, i| command_um[rows[k] - i]);
+        let mut increments =
+            DVector::from_fn(rows.len(), |k, _| left_um[rows[k] + 1] - left_um[rows[k]]);
+        let command = commands.sum() / (count * MEMORY as f64);
+        commands.add_scalar_mut(-command);
+        increments.add_scalar_mut(-increments.sum() / count);
+        let squares = increments.norm_squared();
+        let mut information = commands.tr_mul(&commands);
+        let shared = commands.tr_mul(&increments);
+        let noise = squares / count / (motion.gain * motion.gain);
+        // Commands that leave a part of the response as unknown as before do not tell it: a single sine tells nothing of other
+        // frequencies.
+        let mut beyond = information.clone();
+        for i in 0..MEMORY {
+            beyond[(i, i)] -= noise;
+            information[(i, i)] += noise;
+        }
+        beyond.cholesky()?;
+        let by_row = information.cholesky()?.solve(&shared);
+        if by_row.dot(&shared) < LEAST_SHARE * squares {
+            return None;
+        }
+        // Twice summed: increments of the position by a command of one row, positions by it, and positions by a step.
+        let (mut of_row, mut of_step) = (0.0, vec![0.0]);
+        for um in &by_row {
+            of_row += um;
+            of_step.push(of_step.last().copied().unwrap_or(0.0) + of_row);
+        }
+        Some(Self(of_step))
+    }
+
+    /// As [`Motion::missing_um`], of this response.
+    fn missing_um(&self, command_um: &[f64], handed_over: &[HandedOver]) -> Vec<f64> {
+        let on_time = (command_um.iter().enumerate()).map(|(row, &um)| HandedOver {
+            row: row as f64,
+            um,
+        });
+        // Steps between rows as steps in the rows around, so that the response to the second is the polynomial through that of the first.
+        let mut steps = vec![0.0; command_um.len()];
+        let mut add = |commands: &mut dyn Iterator<Item = HandedOver>, sign: f64| {
+            let mut held_um = None;
+            for HandedOver { row, um } in commands {
+                let step = sign * (um - held_um.replace(um).unwrap_or(um));
+                let next = row.ceil();
+                for (weight, place) in weights(next - row).into_iter().zip(PLACES) {
+                    let row = next - place;
+                    if let Some(sum) = steps.get_mut(row as usize).filter(|_| row >= 0.0) {
+                        *sum += step * weight;
+                    }
+                }
+            }
+        };
+        add(&mut on_time.into_iter(), 1.0);
+        add(&mut handed_over.iter().copied(), -1.0);
+        // Behind the last row of the response its last increment goes on.
+        let last = self.0.len() - 1;
+        let increment = self.0[last] - self.0[last - 1];
+        let (mut level, mut slope) = (0.0, 0.0);
+        (0..steps.len())
+            .map(|row| {
+                if let Some(old) = row.checked_sub(last + 1) {
+                    level += increment * slope + self.0[last] * steps[old];
+                    slope += steps[old];
+                    // The step is one row beyond the response by now.
+                    level += increment * steps[old];
+                }
+                let recent = self.0.iter().zip(steps[..=row].iter().rev());
+                level + recent.map(|(after, step)| after * step).sum::<f64>()
+            })
+            .collect()
+    }
+}
+
+/// Rows about a place between the rows 0 and 1.
+const PLACES: [f64; 6] = [-2.0, -1.0, 0.0, 1.0, 2.0, 3.0];
+
+/// Weights of the values at [`PLACES`] in the polynomial through them, at a place (Lagrange).
+fn weights(at: f64) -> [f64; 6] {
+    PLACES.map(|own| {
+        let others = PLACES.iter().filter(|other| **other != own);
+        others.map(|other| (at - other) / (own - other)).product()
+    })
+}
+
+/// A command that was handed over.
+#[derive(Debug, Clone, Copy)]
+pub struct HandedOver {
+    /// When, in rows.
+    pub row: f64,
+    /// The command.
+    pub um: f64,
+}
+
+/// The integral of held commands from the first row on. Before the first command that one was held.
+struct Integral<I: Iterator<Item = HandedOver>> {
+    to_come: std::iter::Peekable<I>,
+    held_um: f64,
+    /// Up to which row, and the integral up to there.
+    row: f64,
+    sum: f64,
+}
+
+impl<I: Iterator<Item = HandedOver>> Integral<I> {
+    fn of(commands: I) -> Self {
+        let mut to_come = commands.peekable();
+        Self {
+            held_um: to_come.peek().map_or(0.0, |first| first.um),
+            to_come,
+            row: 0.0,
+            sum: 0.0,
+        }
+    }
+
+    /// Up to a row, no earlier than that of the call before.
+    fn until(&mut self, row: f64) -> f64 {
+        while let Some(next) = self.to_come.next_if(|next| next.row <= row) {
+            self.advance(next.row);
+            self.held_um = next.um;
+        }
+        self.advance(row);
+        self.sum
+    }
+
+    fn advance(&mut self, row: f64) {
+        if row > self.row {
+            self.sum += self.held_um * (row - self.row);
+            self.row = row;
+        }
+    }
+}
+
+/// Positions as they would be if the command of each row had been handed over with the row, um. Commands (um), positions (um, NaN without
+/// a bead) and `late` have one value for each row, `handed_over` rises in time. A row is `late` if its command came half a row late or never;
+/// `age` is that of the frames in rows. Where the rows do not tell how a command moves the bead, the positions stay as they are.
+///
+/// # Panics
+/// Of the columns one is shorter than the commands.
+pub fn as_if_on_time(
+    command_um: &[f64],
+    position_um: &[f64],
+    handed_over: &[HandedOver],
+    late: &[bool],
+    age: f64,
+) -> Vec<f64> {
+    let plus = |um: &[f64], missing_um: Vec<f64>| -> Vec<f64> {
+        um.iter()
+            .zip(missing_um)
+            .map(|(um, more)| um + more)
+            .collect()
+    };
+    let motion_of = |on_time_um: &[f64]| Motion::of(command_um, on_time_um, late, age);
+    let with = |motion: Motion| plus(position_um, motion.missing_um(command_um, handed_over));
+    // The first motion is found with the lateness in it, the second without.
+    let Some(motion) = motion_of(position_um).and_then(|first| motion_of(&with(first))) else {
+        return position_um.to_vec();
+    };
+    let moved_um = with(motion);
+    let followed_um = motion.position_um(command_um);
+    let mut on_time_um = moved_um.clone();
+    // What rings is found with its own lateness in it, and once more without.
+    for _ in 0..2 {
+        let left_um: Vec<f64> = (on_time_um.iter().zip(&followed_um))
+            .map(|(um, followed)| um - followed)
+            .collect();
+        let Some(ringing) = Ringing::of(motion, command_um, &left_um, late) else {
+            break;
+        };
+        on_time_um = plus(&moved_um, ringing.missing_um(command_um, handed_over));
+    }
+    on_time_um
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cellpos_numeric::Random;
+    use std::f64::consts::TAU;
+
+    /// Positions of a bead whose flow follows the commands with a resonance of 250 Hz and a damping of 0.1, and then with its delay.
+    fn resonant(commands: &[HandedOver], rows: usize) -> Vec<f64> {
+        const STEPS: usize = 200;
+        let (omega, step) = (TAU * 0.25, 1.0 / STEPS as f64);
+        let (mut x, mut v, mut position) = (0.0, 0.0, 0.0);
+        let mut to_come = commands.iter().peekable();
+        let mut held_um = 0.0;
+        let late = (2.3 * STEPS as f64).round() as usize;
+        let mut path = vec![0.0; late];
+        for k in 0..rows * STEPS {
+            while let Some(next) = to_come.next_if(|next| next.row <= k as f64 * step + 1e-9) {
+                held_um = next.um;
+            }
+            path.push(position);
+            v += step * (omega * omega * (held_um - x) - 0.2 * omega * v);
+            x += step * v;
+            position += 0.4 * step * x;
+        }
+        path.into_iter().step_by(STEPS).take(rows).collect()
+    }
+
+    #[test]
+    fn what_late_commands_leave_out_of_a_ringing_motion_is_added() {
+        const ROWS: usize = 8000;
+        let mut random = Random::new(5);
+        let command_um: Vec<f64> = (0..ROWS).map(|_| 0.2 * random.normal()).collect();
+        let handed_over = |late: f64, random: &mut Random| -> Vec<HandedOver> {
+            (command_um.iter().enumerate())
+                .map(|(row, &um)| HandedOver {
+                    row: row as f64 + late * random.uniform().powi(4),
+                    um,
+                })
+                .collect()
+        };
+        let due = resonant(&handed_over(0.0, &mut random), ROWS);
+        let late = handed_over(0.49, &mut random);
+        let came = resonant(&late, ROWS);
+        let rms = |um: &[f64]| -> f64 {
+            let steps = um.windows(2).zip(due.windows(2)).skip(100);
+            let squares = steps.map(|(a, b)| ((a[1] - a[0]) - (b[1] - b[0])).powi(2));
+            (squares.sum::<f64>() / ROWS as f64).sqrt()
+        };
+        let on_time = as_if_on_time(&command_um, &came, &late, &vec![false; ROWS], 2.1);
+        let (before, after) = (rms(&came), rms(&on_time));
+        assert!(after < 0.25 * before, "{after} um of {before} um");
+    }
+}
