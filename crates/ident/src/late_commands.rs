@@ -100,11 +100,7 @@ fn integrals(
     handed_over: &[HandedOver],
     at: impl Fn(f64) -> f64,
 ) -> [Vec<f64>; 2] {
-    let on_time = |(row, um): (usize, &f64)| HandedOver {
-        row: row as f64,
-        um: *um,
-    };
-    let mut due = Integral::of(command_um.iter().enumerate().map(on_time));
+    let mut due = Integral::of(on_time(command_um));
     let mut came = Integral::of(handed_over.iter().copied());
     let rows = || (0..command_um.len()).map(|row| at(row as f64));
     [
@@ -117,7 +113,7 @@ fn integrals(
 struct Ringing(Vec<f64>);
 
 impl Ringing {
-    /// By the increments that a motion leaves. Each of them is as large as the gain of the motion before the rows are seen.
+    /// By the increments that a motion leaves. Before the rows are seen, the response in each row may be as large as that of the motion.
     fn of(motion: Motion, command_um: &[f64], left_um: &[f64], late: &[bool]) -> Option<Self> {
         let rows: Vec<usize> = (MEMORY..left_um.len().saturating_sub(1))
             .filter(|&row| !late[row + 1 - MEMORY..=row].contains(&true))
@@ -163,10 +159,6 @@ impl Ringing {
 
     /// As [`Motion::missing_um`], of this response.
     fn missing_um(&self, command_um: &[f64], handed_over: &[HandedOver]) -> Vec<f64> {
-        let on_time = (command_um.iter().enumerate()).map(|(row, &um)| HandedOver {
-            row: row as f64,
-            um,
-        });
         // Steps between rows as steps in the rows around, so that the response to the second is the polynomial through that of the first.
         let mut steps = vec![0.0; command_um.len()];
         let mut add = |commands: &mut dyn Iterator<Item = HandedOver>, sign: f64| {
@@ -182,7 +174,7 @@ impl Ringing {
                 }
             }
         };
-        add(&mut on_time.into_iter(), 1.0);
+        add(&mut on_time(command_um), 1.0);
         add(&mut handed_over.iter().copied(), -1.0);
         // Behind the last row of the response its last increment goes on.
         let last = self.0.len() - 1;
@@ -221,6 +213,14 @@ pub struct HandedOver {
     pub row: f64,
     /// The command.
     pub um: f64,
+}
+
+/// The command of each row, handed over with the row.
+fn on_time(command_um: &[f64]) -> impl Iterator<Item = HandedOver> {
+    (command_um.iter().enumerate()).map(|(row, &um)| HandedOver {
+        row: row as f64,
+        um,
+    })
 }
 
 /// The integral of held commands from the first row on. Before the first command that one was held.
