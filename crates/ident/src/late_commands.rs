@@ -2,26 +2,34 @@
 //!
 //! A command that is late by part of a row moves the bead less by that part of its step, for good. The rows themselves tell the gain and the
 //! delay with which commands move the bead, so nothing has to be known of the rig. Moving the commands within the band of the rows instead
-//! would be wrong where lateness follows the excitation: steps hold frequencies beyond that band. What a resonance or a lag adds is slower
-//! than a row, and follows from the rows too.
+//! would be wrong where lateness follows the excitation: steps hold frequencies beyond that band. A resonance or a lag adds a motion that
+//! is slower than a row and follows from the rows too.
 
 use nalgebra::{DMatrix, DVector};
 
-/// Upper limit of the delay from a command to its effect, in periods: at 1 kHz over USB or a serial line, with the lateness of a tick
-/// included.
+/// Upper limit of the delay from a command to its effect, in periods, at 1 kHz over USB or a serial line. It includes the lateness of a
+/// tick.
 const LINE_PERIODS: f64 = 1.0;
 
 /// Rows in which the chip's response to a command comes to its end: a resonance of 250 Hz rings for 25 ms.
 const MEMORY: usize = 40;
 
-/// Rows at most from which that response is found.
+/// Most rows from which the forty values of that response are found.
 const ROWS: usize = 8000;
 
-/// Part of the squares that a motion leaves which a response must explain. A smaller one changes what is missing of late commands by less
-/// than the noise, and stalls leave as much.
+/// Least part that a response must explain of the squares that a motion leaves. The motion left over by stalls is as large.
 const LEAST_SHARE: f64 = 0.1;
 
-/// A bead whose speed goes with the command, some time later.
+/// Increments of a position by row, from row `first` on, where no command of the row and of `reach` rows before it was late.
+fn increments(um: &[f64], late: &[bool], first: usize, reach: usize) -> Vec<(usize, f64)> {
+    (first..um.len().saturating_sub(1))
+        .filter(|&row| !late[row - reach..=row].contains(&true))
+        .map(|row| (row, um[row + 1] - um[row]))
+        .filter(|(_, um)| um.is_finite())
+        .collect()
+}
+
+/// A bead whose speed is proportional to the command, some time later.
 #[derive(Debug, Clone, Copy)]
 struct Motion {
     /// Motion in a row over the command.
@@ -31,17 +39,13 @@ struct Motion {
 }
 
 impl Motion {
-    /// The motion that fits best to rows whose commands were on time and whose frames are so many rows old. `None` if the commands do not
+    /// The motion that fits best to rows whose commands were on time and whose frames are `age` rows old. `None` if the commands do not
     /// vary, or too few rows are left.
     fn of(command_um: &[f64], position_um: &[f64], late: &[bool], age: f64) -> Option<Self> {
         /// Delays are tried in steps of this part of a row.
         const STEP: f64 = 0.01;
         let reach = (age + LINE_PERIODS) as usize + 1;
-        let increments: Vec<(usize, f64)> = (reach..position_um.len().saturating_sub(1))
-            .filter(|&row| !late[row - reach..=row].contains(&true))
-            .map(|row| (row, position_um[row + 1] - position_um[row]))
-            .filter(|(_, um)| um.is_finite())
-            .collect();
+        let increments = increments(position_um, late, reach, reach);
         let rows = increments.len() as f64;
         let y: f64 = increments.iter().map(|(_, um)| um).sum();
         let yy: f64 = increments.iter().map(|(_, um)| um * um).sum();
@@ -79,34 +83,13 @@ impl Motion {
             .map(|(motion, _)| motion)
     }
 
-    /// How far the bead would be farther in each row if the command of each row had been handed over with the row, um.
-    fn missing_um(&self, command_um: &[f64], handed_over: &[HandedOver]) -> Vec<f64> {
-        let [due, came] = integrals(command_um, handed_over, |row| row - self.delay);
-        (due.iter().zip(came))
-            .map(|(due, came)| self.gain * (due - came))
+    /// The position in each row under these commands, um.
+    fn position_um(&self, commands: impl Iterator<Item = HandedOver>, rows: usize) -> Vec<f64> {
+        let mut integral = Integral::of(commands);
+        (0..rows)
+            .map(|row| self.gain * integral.until(row as f64 - self.delay))
             .collect()
     }
-
-    /// The position if the command of each row had been handed over with the row, um.
-    fn position_um(&self, command_um: &[f64]) -> Vec<f64> {
-        let [due, _] = integrals(command_um, &[], |row| row - self.delay);
-        due.iter().map(|um| self.gain * um).collect()
-    }
-}
-
-/// The integrals of the commands if each had been handed over with its row, and as they were, up to an instant of each row.
-fn integrals(
-    command_um: &[f64],
-    handed_over: &[HandedOver],
-    at: impl Fn(f64) -> f64,
-) -> [Vec<f64>; 2] {
-    let mut due = Integral::of(on_time(command_um));
-    let mut came = Integral::of(handed_over.iter().copied());
-    let rows = || (0..command_um.len()).map(|row| at(row as f64));
-    [
-        rows().map(|row| due.until(row)).collect(),
-        rows().map(|row| came.until(row)).collect(),
-    ]
 }
 
 /// The response to a step of the command beyond [`Motion`], of a resonance, a lag or a relaxation: after each row, in um per um.
@@ -115,20 +98,12 @@ struct Ringing(Vec<f64>);
 impl Ringing {
     /// By the increments that a motion leaves. Before the rows are seen, the response in each row may be as large as that of the motion.
     fn of(motion: Motion, command_um: &[f64], left_um: &[f64], late: &[bool]) -> Option<Self> {
-        let rows: Vec<usize> = (MEMORY..left_um.len().saturating_sub(1))
-            .filter(|&row| !late[row + 1 - MEMORY..=row].contains(&true))
-            .filter(|&row| (left_um[row + 1] - left_um[row]).is_finite())
-            .collect();
-        // So many rows tell forty values well enough.
-        let rows: Vec<usize> = rows
-            .iter()
-            .copied()
-            .step_by(1 + rows.len() / ROWS)
-            .collect();
+        let mut rows = increments(left_um, late, MEMORY, MEMORY - 1);
+        let every = 1 + rows.len() / ROWS;
+        rows = rows.into_iter().step_by(every).collect();
         let count = rows.len().max(1) as f64;
-        let mut commands = DMatrix::from_fn(rows.len(), MEMORY, |k, i| command_um[rows[k] - i]);
-        let mut increments =
-            DVector::from_fn(rows.len(), |k, _| left_um[rows[k] + 1] - left_um[rows[k]]);
+        let mut commands = DMatrix::from_fn(rows.len(), MEMORY, |k, i| command_um[rows[k].0 - i]);
+        let mut increments = DVector::from_fn(rows.len(), |k, _| rows[k].1);
         let command = commands.sum() / (count * MEMORY as f64);
         commands.add_scalar_mut(-command);
         increments.add_scalar_mut(-increments.sum() / count);
@@ -157,7 +132,7 @@ impl Ringing {
         Some(Self(of_step))
     }
 
-    /// As [`Motion::missing_um`], of this response.
+    /// How far the bead would be farther in each row by this response if every command had been on time, um.
     fn missing_um(&self, command_um: &[f64], handed_over: &[HandedOver]) -> Vec<f64> {
         // Steps between rows as steps in the rows around, so that the response to the second is the polynomial through that of the first.
         let mut steps = vec![0.0; command_um.len()];
@@ -176,7 +151,7 @@ impl Ringing {
         };
         add(&mut on_time(command_um), 1.0);
         add(&mut handed_over.iter().copied(), -1.0);
-        // Behind the last row of the response its last increment goes on.
+        // Behind its last row the response is a straight line with its last increment.
         let last = self.0.len() - 1;
         let increment = self.0[last] - self.0[last - 1];
         let (mut level, mut slope) = (0.0, 0.0);
@@ -274,30 +249,40 @@ pub fn as_if_on_time(
     late: &[bool],
     age: f64,
 ) -> Vec<f64> {
-    let plus = |um: &[f64], missing_um: Vec<f64>| -> Vec<f64> {
-        um.iter()
-            .zip(missing_um)
+    let rows = command_um.len();
+    let motion_of = |on_time_um: &[f64]| Motion::of(command_um, on_time_um, late, age);
+    let due_um = |motion: Motion| motion.position_um(on_time(command_um), rows);
+    let with = |motion: Motion, due_um: &[f64]| -> Vec<f64> {
+        let came_um = motion.position_um(handed_over.iter().copied(), rows);
+        let missing = due_um.iter().zip(came_um).map(|(due, came)| due - came);
+        position_um
+            .iter()
+            .zip(missing)
             .map(|(um, more)| um + more)
             .collect()
     };
-    let motion_of = |on_time_um: &[f64]| Motion::of(command_um, on_time_um, late, age);
-    let with = |motion: Motion| plus(position_um, motion.missing_um(command_um, handed_over));
     // The first motion is found with the lateness in it, the second without.
-    let Some(motion) = motion_of(position_um).and_then(|first| motion_of(&with(first))) else {
+    let second = |first| motion_of(&with(first, &due_um(first)));
+    let Some(motion) = motion_of(position_um).and_then(second) else {
         return position_um.to_vec();
     };
-    let moved_um = with(motion);
-    let followed_um = motion.position_um(command_um);
+    let due_um = due_um(motion);
+    let moved_um = with(motion, &due_um);
     let mut on_time_um = moved_um.clone();
-    // What rings is found with its own lateness in it, and once more without.
+    // The ringing is found with its own lateness in it, and once more without.
     for _ in 0..2 {
-        let left_um: Vec<f64> = (on_time_um.iter().zip(&followed_um))
-            .map(|(um, followed)| um - followed)
+        let left_um: Vec<f64> = (on_time_um.iter().zip(&due_um))
+            .map(|(um, due)| um - due)
             .collect();
         let Some(ringing) = Ringing::of(motion, command_um, &left_um, late) else {
             break;
         };
-        on_time_um = plus(&moved_um, ringing.missing_um(command_um, handed_over));
+        let missing_um = ringing.missing_um(command_um, handed_over);
+        on_time_um = moved_um
+            .iter()
+            .zip(missing_um)
+            .map(|(um, more)| um + more)
+            .collect();
     }
     on_time_um
 }

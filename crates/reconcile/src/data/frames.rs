@@ -41,46 +41,30 @@ impl FrameCounts {
     /// Counts the missing frames of a record. A stall of the machine leaves rows in doubt and loses the frames beside them. A camera
     /// loses frames everywhere alike, so that rows that are not beside a stall tell its rate.
     fn count_missing(&mut self, r: &Record) {
-        #[derive(Clone, Copy, PartialEq)]
-        enum Row {
-            Seen,
-            Missing,
-            InDoubt,
-        }
-        let is = |flags: &[bool], k: usize| flags.get(k).is_some_and(|flag| *flag);
-        let mut rows: Vec<Row> = (0..r.rows())
-            .map(|k| match r.bead_um[k].is_nan() {
-                _ if is(&r.unseen, k) || is(&r.late_command, k) => Row::InDoubt,
-                true => Row::Missing,
-                false => Row::Seen,
-            })
-            .collect();
         // Rows before the first bead and after the last say nothing of the camera.
         let seen = |b: &f64| b.is_finite();
-        let first = r.bead_um.iter().position(seen).unwrap_or(rows.len());
-        rows.truncate(r.bead_um.iter().rposition(seen).map_or(0, |last| last + 1));
-        let runs: Vec<&[Row]> = rows
-            .get(first..)
-            .unwrap_or(&[])
-            .chunk_by(|a, b| a == b)
+        let first = r.bead_um.iter().position(seen).unwrap_or(0);
+        let end = r.bead_um.iter().rposition(seen).map_or(0, |last| last + 1);
+        let is = |flags: &[bool], k: usize| flags.get(k).is_some_and(|flag| *flag);
+        let mut in_doubt: Vec<bool> = (first..end)
+            .map(|k| is(&r.unseen, k) || is(&r.late_command, k))
             .collect();
-        for (i, run) in runs.iter().enumerate() {
-            let in_doubt = |j: Option<usize>| {
-                (j.and_then(|j| runs.get(j))).is_some_and(|run| run[0] == Row::InDoubt)
-            };
-            let beside = [i.checked_sub(1), Some(i + 1)].map(in_doubt);
-            match run[0] {
-                Row::Seen => {
-                    let left_out = beside.iter().filter(|beside| **beside).count();
-                    self.rows += run.len().saturating_sub(left_out);
-                }
-                Row::Missing if !beside.contains(&true) => {
-                    self.rows += run.len();
-                    self.missing += run.len();
-                    self.gaps += 1;
-                }
-                Row::Missing | Row::InDoubt => {}
-            }
+        let missing: Vec<bool> = (r.bead_um[first..end].iter().zip(&in_doubt))
+            .map(|(bead, in_doubt)| bead.is_nan() && !in_doubt)
+            .collect();
+        let rows = missing.len();
+        for k in 1..rows {
+            in_doubt[k] |= missing[k] && in_doubt[k - 1];
+        }
+        for k in (1..rows).rev() {
+            in_doubt[k - 1] |= missing[k - 1] && in_doubt[k];
+        }
+        let in_doubt = |k: usize| in_doubt.get(k).is_some_and(|in_doubt| *in_doubt);
+        for k in (0..rows).filter(|&k| ![k.wrapping_sub(1), k, k + 1].into_iter().any(in_doubt)) {
+            self.rows += 1;
+            self.missing += usize::from(missing[k]);
+            // The first row shows a bead.
+            self.gaps += usize::from(missing[k] && !missing[k - 1]);
         }
     }
 

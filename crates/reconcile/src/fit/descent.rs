@@ -124,6 +124,19 @@ impl Context<'_> {
         self.fit_towards(parts, soft, mask, Until::done(iterations))
     }
 
+    /// A fit without its part `index`, fitted from its other numbers.
+    pub(crate) fn fit_without(
+        &self,
+        fit: &Fit,
+        index: usize,
+        mask: &Mask,
+        iterations: usize,
+    ) -> Fit {
+        let mut parts = fit.parts.clone();
+        parts.remove(index);
+        self.fit_from(parts, Some(fit.soft), mask, iterations)
+    }
+
     /// As [`Self::fit_from`], given up where it can no longer come down to a sum of squares.
     pub(crate) fn fit_towards(
         &self,

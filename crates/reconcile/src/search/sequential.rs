@@ -192,9 +192,8 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             if effort.is_over(ctx) {
                 return (fit, Vec::new());
             }
-            let mut parts = fit.parts.clone();
-            let id = parts.remove(i).id();
-            let without = ctx.fit_from(parts, Some(fit.soft), mask, 10);
+            let id = fit.parts[i].id();
+            let without = ctx.fit_without(&fit, i, mask, 10);
             let mut list: Vec<Rival> = Vec::new();
             for other in extensions(
                 ctx,

@@ -41,9 +41,7 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found, threads: usize) ->
     while found.fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..found.fit.parts.len()).collect();
         let without = cellpos_numeric::parallel::map(&indices, threads, |&i| {
-            let mut parts = found.fit.parts.clone();
-            parts.remove(i);
-            ctx.fit_from(parts, Some(found.fit.soft), &all, ROUNDS)
+            ctx.fit_without(&found.fit, i, &all, ROUNDS)
         });
         let worth: Vec<f64> = without
             .iter()

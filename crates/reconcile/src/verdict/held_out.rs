@@ -193,9 +193,7 @@ fn change(without: &Fit, with: &Fit) -> Vec<Vec<f64>> {
 fn unconfirmed(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<usize> {
     let indices: Vec<usize> = (0..fit.parts.len()).collect();
     let fails = cellpos_numeric::parallel::map(&indices, threads, |&i| {
-        let mut parts = fit.parts.clone();
-        parts.remove(i);
-        let without = ctx.fit_from(parts, Some(fit.soft), &ctx.problem.all(), ROUNDS);
+        let without = ctx.fit_without(fit, i, &ctx.problem.all(), ROUNDS);
         let splits = splits_of(&change(&without, fit));
         let gains = splits.iter().map(|(train, _)| {
             let of = |all: &Fit| surprise(all, &ctx.refit(all, train, ROUNDS));

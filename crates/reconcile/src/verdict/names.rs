@@ -133,9 +133,7 @@ pub(crate) fn names(
     };
     for (i, part) in fit.parts.iter().enumerate() {
         let id = part.id();
-        let mut parts = fit.parts.clone();
-        parts.remove(i);
-        let without = ctx.fit_from(parts, Some(fit.soft), &all, 8);
+        let without = ctx.fit_without(fit, i, &all, 8);
         let gain = (without.chi2 - fit.chi2).max(0.0);
         let no_memory = LazyCell::new(|| WithoutMemory::beside(ctx, &without));
         let of_no_memory = |part: &Part, gained: f64| {

@@ -372,15 +372,14 @@ impl Searching<'_> {
             let in_chip = matches!(e.kind().spec().place, Place::Chip | Place::Bead);
             in_chip && matches!(e.act(), Action::Block(_))
         };
-        let parts = &own.fit.parts;
-        if parts.len() < 2 || !self.effects(&own.fit).iter().any(bends) {
+        let count = own.fit.parts.len();
+        if count < 2 || !self.effects(&own.fit).iter().any(bends) {
             return None;
         }
-        let without = (0..parts.len()).map(|i| {
-            let mut parts = parts.clone();
-            parts.remove(i);
-            let ctx = self.context(&own.problem, 0);
-            let fit = ctx.fit_from(parts, Some(own.fit.soft), &own.problem.all(), 8);
+        let ctx = self.context(&own.problem, 0);
+        let all = own.problem.all();
+        let without = (0..count).map(|i| {
+            let fit = ctx.fit_without(&own.fit, i, &all, 8);
             self.with_zero_flow(&own.problem, &fit, own.cost)
         });
         without

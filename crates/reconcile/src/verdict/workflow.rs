@@ -317,9 +317,7 @@ fn drop_small(ctx: &Context<'_>, found: &mut Found, threads: usize) {
             i += 1;
             continue;
         }
-        let mut parts = found.fit.parts.clone();
-        parts.remove(i);
-        let without = ctx.fit_from(parts, Some(found.fit.soft), &all, 8);
+        let without = ctx.fit_without(&found.fit, i, &all, 8);
         let gained = (found.null.chi2 - found.fit.chi2).max(1e-12);
         if (without.chi2 - found.fit.chi2) / gained > THRESHOLDS.small_share {
             i += 1;
@@ -336,9 +334,7 @@ fn drop_bound(ctx: &Context<'_>, found: &mut Found, effort: Effort) {
     while found.fit.parts.len() > 1
         && let Some((i, _)) = judge::first_at_bound(ctx, &found.fit)
     {
-        let mut parts = found.fit.parts.clone();
-        parts.remove(i);
-        let without = ctx.fit_from(parts, Some(found.fit.soft), &all, 12);
+        let without = ctx.fit_without(&found.fit, i, &all, 12);
         let open = 1.0 - THRESHOLDS.closed_whole;
         if left_over(&without) > open * gap(&found.null) {
             return;
