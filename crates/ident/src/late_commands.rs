@@ -1,4 +1,4 @@
-//! Commands that were handed over late: the positions as they would be if every command had been on time.
+//! Commands that came late: the positions as they would be if every command had been on time.
 //!
 //! A command that is late by part of a row moves the bead less by that part of its step, for good. The rows themselves tell the gain and the
 //! delay with which commands move the bead, so nothing has to be known of the rig. Moving the commands within the band of the rows instead
@@ -84,7 +84,7 @@ impl Motion {
     }
 
     /// The position in each row under these commands, um.
-    fn position_um(&self, commands: impl Iterator<Item = HandedOver>, rows: usize) -> Vec<f64> {
+    fn position_um(&self, commands: impl Iterator<Item = Arrival>, rows: usize) -> Vec<f64> {
         let mut integral = Integral::of(commands);
         (0..rows)
             .map(|row| self.gain * integral.until(row as f64 - self.delay))
@@ -133,12 +133,12 @@ impl Ringing {
     }
 
     /// How far the bead would be farther in each row by this response if every command had been on time, um.
-    fn missing_um(&self, command_um: &[f64], handed_over: &[HandedOver]) -> Vec<f64> {
+    fn missing_um(&self, command_um: &[f64], arrivals: &[Arrival]) -> Vec<f64> {
         // Steps between rows as steps in the rows around, so that the response to the second is the polynomial through that of the first.
         let mut steps = vec![0.0; command_um.len()];
-        let mut add = |commands: &mut dyn Iterator<Item = HandedOver>, sign: f64| {
+        let mut add = |commands: &mut dyn Iterator<Item = Arrival>, sign: f64| {
             let mut held_um = None;
-            for HandedOver { row, um } in commands {
+            for Arrival { row, um } in commands {
                 let step = sign * (um - held_um.replace(um).unwrap_or(um));
                 let next = row.ceil();
                 for (weight, place) in weights(next - row).into_iter().zip(PLACES) {
@@ -150,7 +150,7 @@ impl Ringing {
             }
         };
         add(&mut on_time(command_um), 1.0);
-        add(&mut handed_over.iter().copied(), -1.0);
+        add(&mut arrivals.iter().copied(), -1.0);
         // Behind its last row the response is a straight line with its last increment.
         let last = self.0.len() - 1;
         let increment = self.0[last] - self.0[last - 1];
@@ -181,25 +181,25 @@ fn weights(at: f64) -> [f64; 6] {
     })
 }
 
-/// A command that was handed over.
+/// A command as it came to the board.
 #[derive(Debug, Clone, Copy)]
-pub struct HandedOver {
+pub struct Arrival {
     /// When, in rows.
     pub row: f64,
     /// The command.
     pub um: f64,
 }
 
-/// The command of each row, handed over with the row.
-fn on_time(command_um: &[f64]) -> impl Iterator<Item = HandedOver> {
-    (command_um.iter().enumerate()).map(|(row, &um)| HandedOver {
+/// The command of each row, on time.
+fn on_time(command_um: &[f64]) -> impl Iterator<Item = Arrival> {
+    (command_um.iter().enumerate()).map(|(row, &um)| Arrival {
         row: row as f64,
         um,
     })
 }
 
 /// The integral of held commands from the first row on. Before the first command that one was held.
-struct Integral<I: Iterator<Item = HandedOver>> {
+struct Integral<I: Iterator<Item = Arrival>> {
     to_come: std::iter::Peekable<I>,
     held_um: f64,
     /// Up to which row, and the integral up to there.
@@ -207,7 +207,7 @@ struct Integral<I: Iterator<Item = HandedOver>> {
     sum: f64,
 }
 
-impl<I: Iterator<Item = HandedOver>> Integral<I> {
+impl<I: Iterator<Item = Arrival>> Integral<I> {
     fn of(commands: I) -> Self {
         let mut to_come = commands.peekable();
         Self {
@@ -236,8 +236,8 @@ impl<I: Iterator<Item = HandedOver>> Integral<I> {
     }
 }
 
-/// Positions as they would be if the command of each row had been handed over with the row, um. Commands (um), positions (um, NaN without
-/// a bead) and `late` have one value for each row, `handed_over` rises in time. A row is `late` if its command came half a row late or never;
+/// Positions as they would be if the command of each row had come with the row, um. Commands (um), positions (um, NaN without
+/// a bead) and `late` have one value for each row, `arrivals` rises in time. A row is `late` if its command came half a row late or never;
 /// `age` is that of the frames in rows. Where the rows do not tell how a command moves the bead, the positions stay as they are.
 ///
 /// # Panics
@@ -245,7 +245,7 @@ impl<I: Iterator<Item = HandedOver>> Integral<I> {
 pub fn as_if_on_time(
     command_um: &[f64],
     position_um: &[f64],
-    handed_over: &[HandedOver],
+    arrivals: &[Arrival],
     late: &[bool],
     age: f64,
 ) -> Vec<f64> {
@@ -253,7 +253,7 @@ pub fn as_if_on_time(
     let motion_of = |on_time_um: &[f64]| Motion::of(command_um, on_time_um, late, age);
     let due_um = |motion: Motion| motion.position_um(on_time(command_um), rows);
     let with = |motion: Motion, due_um: &[f64]| -> Vec<f64> {
-        let came_um = motion.position_um(handed_over.iter().copied(), rows);
+        let came_um = motion.position_um(arrivals.iter().copied(), rows);
         let missing = due_um.iter().zip(came_um).map(|(due, came)| due - came);
         position_um
             .iter()
@@ -277,7 +277,7 @@ pub fn as_if_on_time(
         let Some(ringing) = Ringing::of(motion, command_um, &left_um, late) else {
             break;
         };
-        let missing_um = ringing.missing_um(command_um, handed_over);
+        let missing_um = ringing.missing_um(command_um, arrivals);
         on_time_um = moved_um
             .iter()
             .zip(missing_um)
@@ -294,7 +294,7 @@ mod tests {
     use std::f64::consts::TAU;
 
     /// Positions of a bead whose flow follows the commands with a resonance of 250 Hz and a damping of 0.1, and then with its delay.
-    fn resonant(commands: &[HandedOver], rows: usize) -> Vec<f64> {
+    fn resonant(commands: &[Arrival], rows: usize) -> Vec<f64> {
         const STEPS: usize = 200;
         let (omega, step) = (TAU * 0.25, 1.0 / STEPS as f64);
         let (mut x, mut v, mut position) = (0.0, 0.0, 0.0);
@@ -319,16 +319,16 @@ mod tests {
         const ROWS: usize = 8000;
         let mut random = Random::new(5);
         let command_um: Vec<f64> = (0..ROWS).map(|_| 0.2 * random.normal()).collect();
-        let handed_over = |late: f64, random: &mut Random| -> Vec<HandedOver> {
+        let arrivals = |late: f64, random: &mut Random| -> Vec<Arrival> {
             (command_um.iter().enumerate())
-                .map(|(row, &um)| HandedOver {
+                .map(|(row, &um)| Arrival {
                     row: row as f64 + late * random.uniform().powi(4),
                     um,
                 })
                 .collect()
         };
-        let due = resonant(&handed_over(0.0, &mut random), ROWS);
-        let late = handed_over(0.49, &mut random);
+        let due = resonant(&arrivals(0.0, &mut random), ROWS);
+        let late = arrivals(0.49, &mut random);
         let came = resonant(&late, ROWS);
         let rms = |um: &[f64]| -> f64 {
             let steps = um.windows(2).zip(due.windows(2)).skip(100);

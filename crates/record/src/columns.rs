@@ -169,6 +169,8 @@ columns! {
     partner_applied_um F64 Partner,
     partner_effect_um F64 Partner,
     partner U8 Partner,
+    obeyed_before_us F64 Loop,
+    obeyed_at_us F64 Loop,
 }
 
 /// Name of the last column of the file: CRC-32 of the values before it in the row, each in its own width, little-endian. It is

@@ -165,6 +165,11 @@ pub struct TickRecord {
     pub wake_ns: u32,
     /// From the start of the tick to the hand-over of the command, ns; 0 on the virtual clock.
     pub compute_ns: u32,
+    /// From the start of the tick whose command the board has reported since the previous tick to the start of this one, us; of several
+    /// commands the one that was longest on its way. NaN without a new one.
+    pub obeyed_before_us: f64,
+    /// The board's clock when it had that command, us. Only differences tell: its zero is the board's.
+    pub obeyed_at_us: f64,
     /// How the optimiser ended (number of [`cellpos_control::SolverStatus`]; 0: none in use).
     pub solver_status: u8,
     /// Its iterations, at most 255.
@@ -233,6 +238,8 @@ impl TickRecord {
             drained: 0,
             wake_ns: 0,
             compute_ns: 0,
+            obeyed_before_us: f64::NAN,
+            obeyed_at_us: f64::NAN,
             solver_status: 0,
             solver_iterations: 0,
             solver_active: 0,

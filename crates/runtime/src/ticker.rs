@@ -29,6 +29,23 @@ pub struct Order {
     pub time_us: u64,
 }
 
+/// A command that the board has reported.
+#[derive(Debug, Clone, Copy)]
+struct Obeyed {
+    seq: u32,
+    /// Start of its tick, us since the start of the run.
+    host_us: u64,
+    /// The board's clock when it had the command, us.
+    board_us: u64,
+}
+
+impl Obeyed {
+    /// How long it was on its way, plus the difference of the clocks, us.
+    fn offset_us(self) -> i64 {
+        self.board_us.cast_signed() - self.host_us.cast_signed()
+    }
+}
+
 /// The I/O threads' ends of the rings.
 #[derive(Debug)]
 pub struct Ends {
@@ -121,8 +138,10 @@ pub struct Ticker<R> {
     board_watch: BoardWatch,
     /// What had become of the commands by the last tick.
     commands: CommandAccount,
-    /// Sequence number, host's and board's time (us) of the last command that the board has reported.
-    obeyed: Option<(u32, u64, u64)>,
+    /// The last command that the board has reported.
+    obeyed: Option<Obeyed>,
+    /// Of the commands reported since the previous tick the one that was longest on its way.
+    slowest: Option<Obeyed>,
     records_lost_before: bool,
     account: Account,
 }
@@ -167,6 +186,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
             board_watch: BoardWatch::new(silence_ns),
             commands: CommandAccount::default(),
             obeyed: None,
+            slowest: None,
             records_lost_before: false,
             account: Account {
                 tick: Latency::new(),
@@ -252,6 +272,7 @@ impl<R: ReferenceGenerator> Ticker<R> {
         let (newest, frames) = self.frames.take(start_ns);
         let lost_before = self.commands.lost();
         let (board, board_trouble, partner) = self.listen(start_ns);
+        let obeyed = self.slowest.take();
         let since_start = |ns: i64| ns - self.start_ns;
         let ready_ns = newest.map_or(due_ns, |m| m.ready_ns.max(due_ns));
         let input = TickInput {
@@ -319,6 +340,10 @@ impl<R: ReferenceGenerator> Ticker<R> {
         }
         record.wake_ns = clamp_u32(wake_ns);
         record.compute_ns = clamp_u32(compute_ns);
+        if let Some(obeyed) = obeyed {
+            record.obeyed_before_us = (input.time_ns / 1000) as f64 - obeyed.host_us as f64;
+            record.obeyed_at_us = obeyed.board_us as f64;
+        }
         self.hand_over_record(record);
         self.account.events_lost += u64::from(output.events.lost);
         for event in output.events.iter() {
@@ -365,21 +390,28 @@ impl<R: ReferenceGenerator> Ticker<R> {
         (board, trouble, partner)
     }
 
-    /// How far the spacing of commands that the board saw is off that at which they were handed over.
+    /// A report of a new command: how far its distance from the command before is off that at which they were given; and which command
+    /// was longest on its way.
     fn spacing(&mut self, report: &ActuatorReport) {
         let Some(seq) = report.last_seq else { return };
-        let (host_us, board_us) = (report.last_time_us, report.device_time_us);
-        let before = self.obeyed;
-        if before.is_some_and(|(last, ..)| last == seq) {
+        let obeyed = Obeyed {
+            seq,
+            host_us: report.last_time_us,
+            board_us: report.device_time_us,
+        };
+        let Some(before) = self.obeyed.replace(obeyed) else {
+            self.slowest = Some(obeyed);
+            return;
+        };
+        if before.seq == seq {
             return;
         }
-        self.obeyed = Some((seq, host_us, board_us));
-        if let Some((_, host_before, board_before)) = before {
-            let host = host_us.saturating_sub(host_before);
-            let board = board_us.saturating_sub(board_before);
-            let off_ns = host.abs_diff(board).saturating_mul(1000);
-            self.account.board_spacing.record(off_ns, self.ticks);
-        }
+        let host = obeyed.host_us.saturating_sub(before.host_us);
+        let board = obeyed.board_us.saturating_sub(before.board_us);
+        let off_ns = host.abs_diff(board).saturating_mul(1000);
+        self.account.board_spacing.record(off_ns, self.ticks);
+        let slower = |other: &Obeyed| other.offset_us() >= obeyed.offset_us();
+        self.slowest = self.slowest.filter(slower).or(Some(obeyed));
     }
 
     fn hand_over_record(&mut self, mut record: TickRecord) {

@@ -118,6 +118,8 @@ ORDER: Tuple[str, ...] = (
     "drained",
     "wake_us",
     "compute_us",
+    "obeyed_before_us",
+    "obeyed_at_us",
     "track",
     "decision",
     "plan_s",

@@ -235,6 +235,10 @@ columns! {
         "From the arrival of the position, or the due time, to the start of the tick; 0 on the virtual clock.";
     "compute_us" "us" Number(|r| f64::from(r.tick.compute_ns) / 1e3),
         "From the start of the tick to the hand-over of the command; 0 on the virtual clock.";
+    "obeyed_before_us" "us" Number(|r| r.tick.obeyed_before_us),
+        "Age of the slowest command that the board has reported since the last tick.";
+    "obeyed_at_us" "us" Number(|r| r.tick.obeyed_at_us),
+        "Clock of the board when it had that command.";
     "track" "" Code(TRACK, |r| r.tick.track),
         "State of the tracker; none without a frame or a tracker.";
     "decision" "" Code(DECISION, |r| r.tick.decision),

@@ -189,6 +189,8 @@ impl<R: ReferenceGenerator> Core<R> {
             drained: input.frames.arrived.min(255) as u8,
             wake_ns: 0,
             compute_ns: 0,
+            obeyed_before_us: f64::NAN,
+            obeyed_at_us: f64::NAN,
             solver_status: output.solver.status as u8,
             solver_iterations: output.solver.iterations.min(255) as u8,
             solver_active: output.solver.active.min(255) as u8,

@@ -1,9 +1,9 @@
 //! The ticks of a run as an evenly sampled record, and the segments in it.
 
 use crate::experiment::exciting::SETTLE_TICKS;
-use crate::experiment::lateness::{age_ns, is_new_frame, lateness_ns, median, with_new_frame};
+use crate::experiment::lateness::{age_ns, is_new_frame, lateness, median, with_new_frame};
 use cellpos_ident::experiment::{RecordedSegment, Span};
-use cellpos_ident::late_commands::{HandedOver, as_if_on_time};
+use cellpos_ident::late_commands::{Arrival, as_if_on_time};
 use cellpos_runtime::{Grid, TickFlags, TickRecord};
 use cellpos_vision::Decision;
 
@@ -66,7 +66,7 @@ pub struct Delivered {
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,
-    /// Rows whose command came to the board at a time that is not known.
+    /// Rows whose command came to the board half a row late or more, or never.
     pub late_command: Vec<bool>,
 }
 
@@ -77,7 +77,7 @@ pub(crate) struct Rows {
     /// Position of each row, um, as if all commands had been on time; NaN without one.
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
-    /// The command of this row's tick came too late to stand as if on time, or never: when the board had it is not known.
+    /// The command of this row's tick came too late to stand as if on time, or never.
     late: Vec<bool>,
     /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
@@ -125,13 +125,13 @@ impl Rows {
             .position(TickRecord::is_running)
             .unwrap_or(ticks.len());
         let usual_ns = median(with_new_frame(&ticks[closed..]).map(age_ns)).unwrap_or(0);
-        let late_ns = lateness_ns(&ticks[closed..], period_ns);
+        let lateness = lateness(&ticks[closed..], period_ns);
         rows.usual_age_periods = usual_ns.max(0) as f64 / period_ns as f64;
-        let (mut first_id, mut handed_over) = (None, Vec::new());
+        let (mut first_id, mut arrivals) = (None, Vec::new());
         // The clock plays the excitation, so a tick's place in it is its number on the clock's grid.
         let grid = Grid::new(ticks.first().map_or(0, |t| t.time_ns), period_ns);
         let first_index = ticks.get(closed).map_or(0, |t| grid.index(t.time_ns));
-        for (tick, late_ns) in ticks[closed..].iter().zip(late_ns) {
+        for (tick, late) in ticks[closed..].iter().zip(lateness) {
             let has = |flag| tick.flags.has(flag);
             let new_frame = is_new_frame(tick);
             let next = rows.input.len();
@@ -159,15 +159,15 @@ impl Rows {
             let age_ns = age_ns(tick);
             let on_time =
                 new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
-            handed_over.extend(late_ns.map(|ns| HandedOver {
-                row: row as f64 + ns as f64 / period_ns as f64,
+            arrivals.extend(late.map(|late| Arrival {
+                row: row as f64 + late.at_board_ns as f64 / period_ns as f64,
                 um: tick.command_um,
             }));
             // A command half a period late stands nearer to another row: the machine stalled.
-            let late_ns = late_ns.filter(|ns| 2 * ns.abs() < period_ns);
-            rows.late[row] = late_ns.is_none();
+            let late = late.filter(|late| 2 * late.at_board_ns.abs() < period_ns);
+            rows.late[row] = late.is_none();
             // The row's command stands as if on time.
-            rows.ages_ns[row] = late_ns.filter(|_| on_time).map(|late_ns| age_ns - late_ns);
+            rows.ages_ns[row] = (late.filter(|_| on_time)).map(|late| age_ns - late.handed_over_ns);
             rows.input[row] = tick.command_um;
             // A frame that is half a period late came in a stall. When the board had the commands of a stall nobody here knows.
             if let Some(output) = rows.output.get_mut(exposed).filter(|_| on_time) {
@@ -186,7 +186,7 @@ impl Rows {
         rows.output = as_if_on_time(
             &rows.input,
             &rows.output,
-            &handed_over,
+            &arrivals,
             &rows.late,
             rows.usual_age_periods,
         );
