@@ -236,9 +236,19 @@ impl<I: Iterator<Item = Arrival>> Integral<I> {
     }
 }
 
-/// Positions as they would be if the command of each row had come with the row, um. Commands (um), positions (um, NaN without
-/// a bead) and `late` have one value for each row, `arrivals` rises in time. A row is `late` if its command came half a row late or never;
-/// `age` is that of the frames in rows. Where the rows do not tell how a command moves the bead, the positions stay as they are.
+/// Positions as they would be if every command had come on time.
+#[derive(Debug, Clone)]
+pub struct OnTime {
+    /// Position of each row, um; NaN without a bead.
+    pub position_um: Vec<f64>,
+    /// Standard deviation of the motion to each row from the row before, in what the position was moved by, um: the chip need not be
+    /// linear, as this estimate is. Empty if the rows do not tell how a command moves the bead.
+    pub open_um: Vec<f64>,
+}
+
+/// Positions as they would be if the command of each row had come with the row. Commands (um), positions (um, NaN without a bead) and `late`
+/// have one value for each row, `arrivals` rises in time. A row is `late` if nobody knows when its command came; `age` is that of the
+/// frames in rows. Where the rows do not tell how a command moves the bead, the positions stay as they are.
 ///
 /// # Panics
 /// Of the columns one is shorter than the commands.
@@ -248,43 +258,73 @@ pub fn as_if_on_time(
     arrivals: &[Arrival],
     late: &[bool],
     age: f64,
-) -> Vec<f64> {
+) -> OnTime {
+    /// Each round finds the motion with the lateness in it that the round before left.
+    const ROUNDS: usize = 3;
     let rows = command_um.len();
-    let motion_of = |on_time_um: &[f64]| Motion::of(command_um, on_time_um, late, age);
-    let due_um = |motion: Motion| motion.position_um(on_time(command_um), rows);
-    let with = |motion: Motion, due_um: &[f64]| -> Vec<f64> {
-        let came_um = motion.position_um(arrivals.iter().copied(), rows);
-        let missing = due_um.iter().zip(came_um).map(|(due, came)| due - came);
-        position_um
-            .iter()
-            .zip(missing)
-            .map(|(um, more)| um + more)
-            .collect()
+    let plus = |um: &[f64], more: &[f64]| -> Vec<f64> {
+        um.iter().zip(more).map(|(um, more)| um + more).collect()
     };
-    // The first motion is found with the lateness in it, the second without.
-    let second = |first| motion_of(&with(first, &due_um(first)));
-    let Some(motion) = motion_of(position_um).and_then(second) else {
-        return position_um.to_vec();
+    let less = |um: &[f64], other: &[f64]| -> Vec<f64> {
+        um.iter().zip(other).map(|(um, other)| um - other).collect()
     };
-    let due_um = due_um(motion);
-    let moved_um = with(motion, &due_um);
-    let mut on_time_um = moved_um.clone();
-    // The ringing is found with its own lateness in it, and once more without.
-    for _ in 0..2 {
-        let left_um: Vec<f64> = (on_time_um.iter().zip(&due_um))
-            .map(|(um, due)| um - due)
-            .collect();
-        let Some(ringing) = Ringing::of(motion, command_um, &left_um, late) else {
+    let mut on_time_um = position_um.to_vec();
+    let mut found = None;
+    for _ in 0..ROUNDS {
+        let Some(motion) = Motion::of(command_um, &on_time_um, late, age) else {
             break;
         };
-        let missing_um = ringing.missing_um(command_um, arrivals);
-        on_time_um = moved_um
-            .iter()
-            .zip(missing_um)
-            .map(|(um, more)| um + more)
-            .collect();
+        let due_um = motion.position_um(on_time(command_um), rows);
+        let moved_um = less(&due_um, &motion.position_um(arrivals.iter().copied(), rows));
+        on_time_um = plus(position_um, &moved_um);
+        found = Some((motion, due_um, moved_um));
     }
-    on_time_um
+    let Some((motion, mut due_um, moved_um)) = found else {
+        return OnTime {
+            position_um: on_time_um,
+            open_um: Vec::new(),
+        };
+    };
+    let mut missing_um = moved_um.clone();
+    let mut ringing = None;
+    for _ in 0..ROUNDS {
+        let left_um = less(&on_time_um, &due_um);
+        ringing = Ringing::of(motion, command_um, &left_um, late);
+        let Some(ringing) = &ringing else {
+            break;
+        };
+        missing_um = plus(&moved_um, &ringing.missing_um(command_um, arrivals));
+        on_time_um = plus(position_um, &missing_um);
+    }
+    if let Some(ringing) = ringing {
+        // Of commands that never came all is missing.
+        due_um = plus(&due_um, &ringing.missing_um(command_um, &[]));
+    }
+    let share = left_share(&on_time_um, &due_um, late);
+    let steps = missing_um
+        .windows(2)
+        .map(|pair| share * (pair[1] - pair[0]).abs());
+    OnTime {
+        open_um: std::iter::once(0.0).chain(steps).collect(),
+        position_um: on_time_um,
+    }
+}
+
+/// What the linear motion leaves of the increments of the position, RMS, over the RMS of that motion's own: an upper limit of the part by
+/// which the chip is not as linear as it is, because it contains the noise.
+fn left_share(position_um: &[f64], due_um: &[f64], late: &[bool]) -> f64 {
+    let all = vec![0.0; position_um.len()];
+    let squares = |less: &[f64]| -> f64 {
+        let left: Vec<f64> = (position_um.iter().zip(less))
+            .map(|(um, less)| um - less)
+            .collect();
+        increments(&left, late, 0, 0)
+            .iter()
+            .map(|(_, um)| um * um)
+            .sum()
+    };
+    let left = squares(due_um);
+    (left / (squares(&all) - left).max(left)).sqrt()
 }
 
 #[cfg(test)]
@@ -314,29 +354,57 @@ mod tests {
         path.into_iter().step_by(STEPS).take(rows).collect()
     }
 
-    #[test]
-    fn what_late_commands_leave_out_of_a_ringing_motion_is_added() {
+    /// Increments of what late commands leave of a path, before and after they are put right, RMS in um; and what is said
+    /// to be open.
+    fn put_right(late_rows: impl Fn(&mut Random) -> f64) -> (f64, f64, f64) {
         const ROWS: usize = 8000;
         let mut random = Random::new(5);
         let command_um: Vec<f64> = (0..ROWS).map(|_| 0.2 * random.normal()).collect();
-        let arrivals = |late: f64, random: &mut Random| -> Vec<Arrival> {
-            (command_um.iter().enumerate())
-                .map(|(row, &um)| Arrival {
-                    row: row as f64 + late * random.uniform().powi(4),
-                    um,
-                })
-                .collect()
-        };
-        let due = resonant(&arrivals(0.0, &mut random), ROWS);
-        let late = arrivals(0.49, &mut random);
-        let came = resonant(&late, ROWS);
-        let rms = |um: &[f64]| -> f64 {
+        let due = resonant(&on_time(&command_um).collect::<Vec<_>>(), ROWS);
+        let mut last = 0.0f64;
+        let arrivals: Vec<Arrival> = on_time(&command_um)
+            .map(|Arrival { row, um }| {
+                last = last.max(row + late_rows(&mut random));
+                Arrival { row: last, um }
+            })
+            .collect();
+        let came = resonant(&arrivals, ROWS);
+        let left = |um: &[f64]| -> Vec<f64> {
             let steps = um.windows(2).zip(due.windows(2)).skip(100);
-            let squares = steps.map(|(a, b)| ((a[1] - a[0]) - (b[1] - b[0])).powi(2));
-            (squares.sum::<f64>() / ROWS as f64).sqrt()
+            steps.map(|(a, b)| (a[1] - a[0]) - (b[1] - b[0])).collect()
         };
-        let on_time = as_if_on_time(&command_um, &came, &late, &vec![false; ROWS], 2.1);
-        let (before, after) = (rms(&came), rms(&on_time));
+        let rms = |um: &[f64]| (um.iter().map(|um| um * um).sum::<f64>() / um.len() as f64).sqrt();
+        let on_time = as_if_on_time(&command_um, &came, &arrivals, &vec![false; ROWS], 2.1);
+        let after = left(&on_time.position_um);
+        (rms(&left(&came)), rms(&after), rms(&on_time.open_um))
+    }
+
+    #[test]
+    fn what_late_commands_leave_out_of_a_ringing_motion_is_added() {
+        let (before, after, open) = put_right(|random| 0.49 * random.uniform().powi(4));
+        println!("{before:.5} um become {after:.5}, said to be {open:.5}");
         assert!(after < 0.25 * before, "{after} um of {before} um");
+        assert!(
+            after < 1.5 * open && open < 4.0 * after,
+            "{open} um for {after} um"
+        );
+    }
+
+    #[test]
+    fn commands_that_are_late_by_rows_are_put_right_if_it_is_known_when_they_came() {
+        let stalls = |random: &mut Random| {
+            if random.uniform() < 0.1 {
+                2.5 * random.uniform()
+            } else {
+                0.0
+            }
+        };
+        let (before, after, open) = put_right(stalls);
+        println!("{before:.5} um become {after:.5}, said to be {open:.5}");
+        assert!(after < 0.25 * before, "{after} um of {before} um");
+        assert!(
+            after < 1.5 * open && open < 4.0 * after,
+            "{open} um for {after} um"
+        );
     }
 }

@@ -293,7 +293,8 @@ impl Scales {
         if self.is_of_records() {
             for r in &mut records {
                 r.pzt_um.iter_mut().for_each(|v| *v *= self.input);
-                r.bead_um.iter_mut().for_each(|v| *v *= self.output);
+                let of_bead = r.bead_um.iter_mut().chain(&mut r.late_motion_um);
+                of_bead.for_each(|v| *v *= self.output);
                 r.resolution_um *= self.output;
             }
         }

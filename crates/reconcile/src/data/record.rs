@@ -28,6 +28,9 @@ pub struct Record {
     pub frame_age_s: Vec<f64>,
     /// Rows in a stall of the machine: when their command acted, and so how it moved the bead, is not known.
     pub late_command: Vec<bool>,
+    /// Standard deviation of the motion to each row from the row before that late commands leave open, although it is known when they
+    /// acted \[um\]; empty if none was late.
+    pub late_motion_um: Vec<f64>,
     /// Exposure of every frame about its middle, if it is known \[s\]; else 0.
     pub exposure_s: f64,
 }
@@ -135,6 +138,7 @@ impl Record {
             unseen: vec![false; rows],
             frame_age_s: Vec::new(),
             late_command: vec![false; rows],
+            late_motion_um: Vec::new(),
             exposure_s: 0.0,
         })
     }
@@ -255,6 +259,7 @@ impl Record {
 
     /// The part of a record between two rows, as a separate record.
     pub fn part(&self, from: usize, to: usize) -> Self {
+        let part_of = |known: &[f64]| known.get(from..to).map_or_else(Vec::new, <[f64]>::to_vec);
         Self {
             name: self.name.clone(),
             sample_s: self.sample_s,
@@ -264,8 +269,9 @@ impl Record {
             filled: self.filled[from..to].to_vec(),
             resolution_um: self.resolution_um,
             unseen: self.unseen[from..to].to_vec(),
-            frame_age_s: (self.frame_age_s.get(from..to)).map_or_else(Vec::new, <[f64]>::to_vec),
+            frame_age_s: part_of(&self.frame_age_s),
             late_command: self.late_command[from..to].to_vec(),
+            late_motion_um: part_of(&self.late_motion_um),
             exposure_s: self.exposure_s,
         }
     }
@@ -363,10 +369,16 @@ pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
         match before {
             Some(i) => {
                 let j = &mut joined[i];
-                if !j.frame_age_s.is_empty() || !r.frame_age_s.is_empty() {
-                    j.frame_age_s.resize(j.rows(), f64::NAN);
-                    j.frame_age_s.extend_from_slice(&r.frame_age_s);
-                    j.frame_age_s.resize(j.rows() + r.rows(), f64::NAN);
+                let rows = [j.rows(), j.rows() + r.rows()];
+                for (of_j, of_r, unknown) in [
+                    (&mut j.frame_age_s, &r.frame_age_s, f64::NAN),
+                    (&mut j.late_motion_um, &r.late_motion_um, 0.0),
+                ] {
+                    if !of_j.is_empty() || !of_r.is_empty() {
+                        of_j.resize(rows[0], unknown);
+                        of_j.extend_from_slice(of_r);
+                        of_j.resize(rows[1], unknown);
+                    }
                 }
                 j.late_command.extend_from_slice(&r.late_command);
                 j.pzt_um.extend_from_slice(&r.pzt_um);

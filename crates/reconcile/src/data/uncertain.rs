@@ -5,7 +5,7 @@ use crate::data::record::Record;
 /// How much the bead may have moved by commands that are not known, in each row \[um^2\]; `None` if all are.
 pub(crate) fn uncertain_command(r: &Record, gain_per_sample: f64) -> Option<Vec<f64>> {
     let guessed = r.filled.contains(&true) && r.period_rows().is_none();
-    if !guessed && !r.late_command.contains(&true) {
+    if !guessed && !r.late_command.contains(&true) && r.late_motion_um.is_empty() {
         return None;
     }
     let mut extra = vec![0.0; r.rows()];
@@ -13,6 +13,9 @@ pub(crate) fn uncertain_command(r: &Record, gain_per_sample: f64) -> Option<Vec<
         add_guessed(r, gain_per_sample, &mut extra);
     }
     add_late(r, gain_per_sample, &mut extra);
+    for (extra, sd_um) in extra.iter_mut().zip(&r.late_motion_um) {
+        *extra += sd_um * sd_um;
+    }
     Some(extra)
 }
 

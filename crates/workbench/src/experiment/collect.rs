@@ -234,6 +234,7 @@ fn of_rows(name: &str, rows: &Delivered, period_s: f64) -> Result<Record, Failur
     record.unseen.clone_from(&rows.unseen);
     record.frame_age_s.clone_from(&rows.frame_age_s);
     record.late_command.clone_from(&rows.late_command);
+    record.late_motion_um.clone_from(&rows.late_motion_um);
     Ok(record)
 }
 
@@ -257,6 +258,8 @@ pub const EXPOSURE: &str = "exposure_s";
 
 /// Column of a record: 1 in a stall, in which nobody knows when a row's command acted, else 0.
 pub const LATE_COMMAND: &str = "late_command";
+/// Column of a record: standard deviation of the motion from the row before that late commands leave open, um.
+pub const LATE_MOTION: &str = "late_motion_um";
 /// Column of a record with 1 where a row's frame came, with a bead or without, and 0 where it was dropped.
 pub const FRAME_CAME: &str = "frame_came";
 
@@ -272,6 +275,9 @@ pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
             .iter()
             .map(|late| f64::from(u8::from(*late)));
         more.push((LATE_COMMAND.to_owned(), late.collect()));
+    }
+    if !record.late_motion_um.is_empty() {
+        more.push((LATE_MOTION.to_owned(), record.late_motion_um.clone()));
     }
     if record.unseen.contains(&true) {
         let came = (record.unseen.iter().zip(&record.bead_um))

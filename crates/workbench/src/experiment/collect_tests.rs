@@ -8,7 +8,10 @@
 //! Every seed is a different rig. Its zero flow wanders by 2 to 20 nm in 5 to 50 s and drifts by up to 5 nm/s. Its camera's clock is up
 //! to 15 ppm off and stalls now and then. Light and focus differ.
 
-use super::{Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, look, neutral_um, refused};
+use super::{
+    Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, LATE_MOTION, look, neutral_um,
+    refused,
+};
 use crate::experiment::on_rig::OnRig;
 use cellpos_emulator::{FaultEvent, FaultKind, WorldConfig};
 use cellpos_numeric::Random;
@@ -178,6 +181,7 @@ fn kept(folder: &Path) -> Vec<Record> {
             if let Some(late) = read.column(LATE_COMMAND) {
                 record.late_command = late.iter().map(|late| *late == 1.0).collect();
             }
+            record.late_motion_um = read.column(LATE_MOTION).unwrap_or_default().to_vec();
             record.exposure_s = read.column(EXPOSURE).map_or(0.0, |c| c[0]);
             if let Some(came) = read.column(FRAME_CAME) {
                 record.unseen = (came.iter().zip(&record.bead_um))

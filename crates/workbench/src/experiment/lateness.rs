@@ -29,6 +29,8 @@ pub(crate) struct Late {
     pub(crate) handed_over_ns: i64,
     /// To the board: by its own report, or as if it took the usual time on the line.
     pub(crate) at_board_ns: i64,
+    /// Whether the board tells when it had its commands of this second.
+    pub(crate) told: bool,
 }
 
 /// How long the command of each tick was on its way to the board, ns, plus the difference of the clocks. `None` if no report tells.
@@ -79,6 +81,7 @@ pub(crate) fn lateness(ticks: &[TickRecord], period_ns: i64) -> Vec<Option<Late>
                 Late {
                     handed_over_ns: handed_over_ns - due_ns,
                     at_board_ns: at_board_ns - due_ns,
+                    told: usual_way_ns.is_some(),
                 }
             }));
         }

@@ -66,8 +66,10 @@ pub struct Delivered {
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,
-    /// Rows whose command came to the board half a row late or more, or never.
+    /// Rows whose command came late or never, and nobody knows when.
     pub late_command: Vec<bool>,
+    /// Standard deviation of the motion to each row that commands leave open which came late at a known time, um.
+    pub late_motion_um: Vec<f64>,
 }
 
 /// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
@@ -77,8 +79,10 @@ pub(crate) struct Rows {
     /// Position of each row, um, as if all commands had been on time; NaN without one.
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
-    /// The command of this row's tick came too late to stand as if on time, or never.
+    /// When the command of this row came is not known: it was late, or never came.
     late: Vec<bool>,
+    /// Standard deviation of the motion to each row that late commands leave open, um.
+    late_motion_um: Vec<f64>,
     /// The frame came too late, or without a reliable bead.
     pub(crate) unseen: Vec<bool>,
     /// The frame came in time and showed no reliable bead.
@@ -113,6 +117,7 @@ impl Rows {
             output: Vec::new(),
             usable: Vec::new(),
             late: Vec::new(),
+            late_motion_um: Vec::new(),
             unseen: Vec::new(),
             without_bead: Vec::new(),
             repeated: Vec::new(),
@@ -157,23 +162,25 @@ impl Rows {
                 rows.ages_ns.push(None);
             }
             let age_ns = age_ns(tick);
-            let on_time =
-                new_frame && !has(TickFlags::LOST) && 2 * (age_ns - usual_ns).abs() < period_ns;
+            let on_time = 2 * (age_ns - usual_ns).abs() < period_ns;
             arrivals.extend(late.map(|late| Arrival {
                 row: row as f64 + late.at_board_ns as f64 / period_ns as f64,
                 um: tick.command_um,
             }));
-            // A command half a period late stands nearer to another row: the machine stalled.
-            let late = late.filter(|late| 2 * late.at_board_ns.abs() < period_ns);
+            // A command half a period late came in a stall of the machine. When the board had it, only the board can tell.
+            let late = late.filter(|late| late.told || 2 * late.at_board_ns.abs() < period_ns);
             rows.late[row] = late.is_none();
+            let seen = new_frame && !has(TickFlags::LOST);
             // The row's command stands as if on time.
-            rows.ages_ns[row] = (late.filter(|_| on_time)).map(|late| age_ns - late.handed_over_ns);
+            rows.ages_ns[row] =
+                (late.filter(|_| seen && on_time)).map(|late| age_ns - late.handed_over_ns);
             rows.input[row] = tick.command_um;
-            // A frame that is half a period late came in a stall. When the board had the commands of a stall nobody here knows.
-            if let Some(output) = rows.output.get_mut(exposed).filter(|_| on_time) {
+            // The same holds for a frame.
+            let seen = seen && (on_time || late.is_some());
+            if let Some(output) = rows.output.get_mut(exposed).filter(|_| seen) {
                 *output = tick.measured_um;
             }
-            rows.unseen[row] = is_unseen(tick) || new_frame && !on_time;
+            rows.unseen[row] = is_unseen(tick) || new_frame && !seen;
             rows.without_bead[row] = is_unseen(tick);
             rows.repeated[row] = repeats_picture(tick);
             rows.unseen[row.saturating_sub(frames_passed_over(tick))..row].fill(true);
@@ -183,13 +190,14 @@ impl Rows {
             rows.of_tick.resize(at.max(rows.of_tick.len()), row);
             rows.of_tick.push(row);
         }
-        rows.output = as_if_on_time(
+        let on_time = as_if_on_time(
             &rows.input,
             &rows.output,
             &arrivals,
             &rows.late,
             rows.usual_age_periods,
         );
+        (rows.output, rows.late_motion_um) = (on_time.position_um, on_time.open_um);
         rows
     }
 
@@ -206,6 +214,7 @@ impl Rows {
             unseen: self.unseen,
             frame_age_s,
             late_command: self.late,
+            late_motion_um: self.late_motion_um,
         }
     }
 

@@ -2,7 +2,7 @@
 
 use super::arrays::read_table;
 use crate::experiment::collect::{
-    EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, record_name, refused,
+    EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, LATE_MOTION, record_name, refused,
 };
 use cellpos_numeric::units::Hertz;
 use cellpos_reconcile::Record;
@@ -71,9 +71,10 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
     let (mut age, exposure) = (beside(FRAME_AGE).unwrap_or_default(), beside(EXPOSURE));
     let mut came = beside(FRAME_CAME).unwrap_or_default();
     let mut late = beside(LATE_COMMAND).unwrap_or_default();
+    let mut late_motion = beside(LATE_MOTION).unwrap_or_default();
     if let Some(rows) = wanted.rows {
         let range = range_of(rows, u.len())?;
-        for values in [&mut age, &mut came, &mut late] {
+        for values in [&mut age, &mut came, &mut late, &mut late_motion] {
             *values = (values.get(range.clone())).map_or_else(Vec::new, <[f64]>::to_vec);
         }
         (u, y, t) = (
@@ -90,7 +91,7 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         .collect();
     let pick = |values: &[f64]| known.iter().map(|&k| values[k]).collect::<Vec<_>>();
     let (mut u, mut y, mut t) = (pick(&u), pick(&y), pick(&t));
-    for values in [&mut age, &mut came, &mut late] {
+    for values in [&mut age, &mut came, &mut late, &mut late_motion] {
         if !values.is_empty() {
             *values = pick(values);
         }
@@ -105,6 +106,7 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         age.clear();
         came.clear();
         late.clear();
+        late_motion.clear();
     }
     let mut record = Record::from_rows(&record_name(path), &t, &u, &y).map_err(refused)?;
     if wanted.held {
@@ -114,6 +116,14 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
         if !late.is_empty() {
             record.late_command = late.iter().map(|late| *late == 1.0).collect();
         }
+        record.late_motion_um = in_rows(&record, &t, &late_motion);
+        (record.late_motion_um.iter_mut()).for_each(|um| {
+            *um = if um.is_finite() {
+                *um * wanted.factors[1]
+            } else {
+                0.0
+            }
+        });
         let came = in_rows(&record, &t, &came);
         if !came.is_empty() {
             record.unseen = (came.iter().zip(&record.bead_um))
