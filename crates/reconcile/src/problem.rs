@@ -287,7 +287,7 @@ impl Problem {
                 } else {
                     0
                 };
-                let u: Vec<f64> = r.pzt_um.iter().map(|v| v - base.working_point_um).collect();
+                let u = r.displacement_um(base.working_point_um);
                 let present: Vec<bool> = r
                     .bead_um
                     .iter()

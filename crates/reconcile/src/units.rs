@@ -296,6 +296,7 @@ impl Scales {
                 let of_bead = r.bead_um.iter_mut().chain(&mut r.late_motion_um);
                 of_bead.for_each(|v| *v *= self.output);
                 r.resolution_um *= self.output;
+                r.slew_um_per_s *= self.input;
             }
         }
         records

@@ -14,6 +14,7 @@ pub(crate) mod no_response;
 pub(crate) mod noise;
 pub(crate) mod record;
 pub(crate) mod repeats;
+mod resolution;
 pub(crate) mod row_noise;
 pub(crate) mod uncertain;
 pub(crate) mod waits;

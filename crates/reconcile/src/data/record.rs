@@ -1,6 +1,8 @@
 //! Records as the workflow sees them: an even time grid, the command in micrometres, the bead where there was one.
 
+use crate::data::resolution::resolution;
 use crate::error::ReconcileError;
+use crate::simulate::slew;
 use crate::thresholds::THRESHOLDS;
 use cellpos_numeric::fft;
 
@@ -29,10 +31,12 @@ pub struct Record {
     /// Rows in a stall of the machine: when their command acted, and so how it moved the bead, is not known.
     pub late_command: Vec<bool>,
     /// Standard deviation of the motion to each row from the row before that late commands leave open, although it is known when they
-    /// acted \[um\]; empty if none was late.
+    /// acted \[um\]; NaN where that is not known, empty if it is nowhere.
     pub late_motion_um: Vec<f64>,
     /// Exposure of every frame about its middle, if it is known \[s\]; else 0.
     pub exposure_s: f64,
+    /// Largest speed of the displacement that the board allows, if it is known \[um/s\]; else 0.
+    pub slew_um_per_s: f64,
 }
 
 impl Record {
@@ -140,6 +144,7 @@ impl Record {
             late_command: vec![false; rows],
             late_motion_um: Vec::new(),
             exposure_s: 0.0,
+            slew_um_per_s: 0.0,
         })
     }
 
@@ -257,6 +262,16 @@ impl Record {
         None
     }
 
+    /// Mean displacement of each row behind the board's slew limit, from a working point \[um\].
+    pub(crate) fn displacement_um(&self, working_point_um: f64) -> Vec<f64> {
+        let mut u: Vec<f64> = self.pzt_um.iter().map(|v| v - working_point_um).collect();
+        if self.slew_um_per_s > 0.0 {
+            let first = u[0];
+            slew(&mut u, self.slew_um_per_s, self.sample_s, first);
+        }
+        u
+    }
+
     /// The part of a record between two rows, as a separate record.
     pub fn part(&self, from: usize, to: usize) -> Self {
         let part_of = |known: &[f64]| known.get(from..to).map_or_else(Vec::new, <[f64]>::to_vec);
@@ -273,6 +288,7 @@ impl Record {
             late_command: self.late_command[from..to].to_vec(),
             late_motion_um: part_of(&self.late_motion_um),
             exposure_s: self.exposure_s,
+            slew_um_per_s: self.slew_um_per_s,
         }
     }
 }
@@ -370,14 +386,14 @@ pub(crate) fn canonical(mut records: Vec<Record>) -> Vec<Record> {
             Some(i) => {
                 let j = &mut joined[i];
                 let rows = [j.rows(), j.rows() + r.rows()];
-                for (of_j, of_r, unknown) in [
-                    (&mut j.frame_age_s, &r.frame_age_s, f64::NAN),
-                    (&mut j.late_motion_um, &r.late_motion_um, 0.0),
+                for (of_j, of_r) in [
+                    (&mut j.frame_age_s, &r.frame_age_s),
+                    (&mut j.late_motion_um, &r.late_motion_um),
                 ] {
                     if !of_j.is_empty() || !of_r.is_empty() {
-                        of_j.resize(rows[0], unknown);
+                        of_j.resize(rows[0], f64::NAN);
                         of_j.extend_from_slice(of_r);
-                        of_j.resize(rows[1], unknown);
+                        of_j.resize(rows[1], f64::NAN);
                     }
                 }
                 j.late_command.extend_from_slice(&r.late_command);
@@ -455,43 +471,4 @@ fn fill(u: &mut [f64]) {
         }
         k = end;
     }
-}
-
-/// The finest step that the values show: a power of ten of which all are multiples, or the smallest increment.
-fn resolution(values: &[f64]) -> f64 {
-    let largest = values
-        .iter()
-        .filter(|v| v.is_finite())
-        .fold(0.0f64, |a, v| a.max(v.abs()));
-    // Numbers may be in any unit: ten decades below the largest.
-    let top = if largest.is_normal() {
-        largest.log10().floor() as i32
-    } else {
-        0
-    };
-    for e in 0..10 {
-        let step = 10f64.powi(top - e);
-        let fits = values.iter().filter(|v| v.is_finite()).take(4000).all(|v| {
-            let x = v / step;
-            (x - x.round()).abs() < 1e-5 + 1e-12 * x.abs()
-        });
-        if largest > 0.0 && fits {
-            return step.max(least_increment(values));
-        }
-    }
-    least_increment(values)
-}
-
-/// The smallest increment that is not zero: the step of a converter whose numbers were scaled.
-fn least_increment(values: &[f64]) -> f64 {
-    let size = values
-        .iter()
-        .filter(|v| v.is_finite())
-        .fold(0.0f64, |a, v| a.max(v.abs()));
-    values
-        .windows(2)
-        .map(|w| (w[1] - w[0]).abs())
-        .filter(|d| *d > 1e-12 * size)
-        .fold(f64::INFINITY, f64::min)
-        .min(1e9)
 }

@@ -14,7 +14,11 @@ pub(crate) fn uncertain_command(r: &Record, gain_per_sample: f64) -> Option<Vec<
     }
     add_late(r, gain_per_sample, &mut extra);
     for (extra, sd_um) in extra.iter_mut().zip(&r.late_motion_um) {
-        *extra += sd_um * sd_um;
+        *extra += if sd_um.is_finite() {
+            sd_um * sd_um
+        } else {
+            0.0
+        };
     }
     Some(extra)
 }
@@ -49,7 +53,7 @@ fn add_guessed(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
     }
 }
 
-/// While a command does not act, the PZT is anywhere that commands were: where it was before, or where the board holds the bead. It shows in
+/// While a command does not act, and nobody knows for how long, the PZT is anywhere that commands were: where it was before, or where the board holds the bead. It shows in
 /// the frames until that of the next row, and these are as old as the record says.
 fn add_late(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
     let rows = r.rows() as f64;
@@ -66,8 +70,10 @@ fn add_late(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
         0.0
     };
     let shows = 2 + age_rows.max(0.0).ceil() as usize;
+    let known = |row: usize| r.late_motion_um.get(row).is_some_and(|um| um.is_finite());
+    let unknown = |row: usize| r.late_command[row] && !known(row);
     for (row, extra) in extra.iter_mut().enumerate() {
-        if r.late_command[row.saturating_sub(shows)..row].contains(&true) {
+        if (row.saturating_sub(shows)..row).any(unknown) {
             *extra += gain_per_sample * gain_per_sample * spread_um2;
         }
     }
@@ -93,5 +99,36 @@ mod tests {
             let expected = if open { 0.16 } else { 0.0 };
             assert!((extra - expected).abs() < 1e-12, "row {row}: {extra}");
         }
+    }
+    #[test]
+    fn a_late_command_that_came_at_a_known_time_leaves_open_what_its_record_says() {
+        let time_s: Vec<f64> = (0..40).map(|k| 1e-3 * f64::from(k)).collect();
+        let pzt_um: Vec<f64> = (0..40).map(|k| f64::from(1 - 2 * (k % 2))).collect();
+        let mut record = Record::from_rows("r", &time_s, &pzt_um, &[0.0; 40]).expect("a record");
+        record.late_command[10] = true;
+        record.late_command[30] = true;
+        record.late_motion_um = vec![0.0; 40];
+        (record.late_motion_um[12], record.late_motion_um[30]) = (0.01, f64::NAN);
+        let extra = uncertain_command(&record, 0.4).expect("late rows");
+        for (row, extra) in extra.iter().enumerate() {
+            let expected = match row {
+                12 => 1e-4,
+                31 | 32 => 0.16,
+                _ => 0.0,
+            };
+            assert!((extra - expected).abs() < 1e-12, "row {row}: {extra}");
+        }
+    }
+
+    #[test]
+    fn a_board_that_moves_in_ramps_moves_less_in_the_row_of_a_step() {
+        let time_s: Vec<f64> = (0..20).map(|k| 1e-3 * f64::from(k)).collect();
+        let pzt_um: Vec<f64> = (0..20).map(|k| if k < 8 { 20.0 } else { 21.0 }).collect();
+        let mut record = Record::from_rows("r", &time_s, &pzt_um, &[0.0; 20]).expect("a record");
+        record.slew_um_per_s = 5000.0;
+        let u = record.displacement_um(20.0);
+        // A ramp of 0.2 ms: a tenth of the step is missing in the row's mean.
+        assert!((u[8] - 0.9).abs() < 1e-12, "{}", u[8]);
+        assert!(u[..8].iter().all(|u| *u == 0.0) && u[9..].iter().all(|u| *u == 1.0));
     }
 }

@@ -25,10 +25,9 @@ impl<'a> Input<'a> {
     }
 }
 
-/// Rate limit; each step holds the mean of the ramp over the step, so that its integral is exact.
-pub(super) fn slew(x: &mut [f64], rate: f64, h: f64) {
+/// Rate limit, from a rest at `at`; each step holds the mean of the ramp over the step, so that its integral is exact.
+pub(crate) fn slew(x: &mut [f64], rate: f64, h: f64, mut at: f64) {
     let most = rate * h;
-    let mut at = 0.0f64;
     for v in x.iter_mut() {
         let d = (*v - at).clamp(-most, most);
         let share = if most > 0.0 { d.abs() / most } else { 0.0 };

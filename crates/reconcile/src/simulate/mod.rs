@@ -15,7 +15,7 @@ use cellpos_plant::TiedPlant;
 use cellpos_plant::effects::{Action, Around, Block, Piece, Shown};
 pub(crate) use cellpos_plant::{Effect, Place, Zpk};
 pub(crate) use input::Input;
-use input::slew;
+pub(crate) use input::slew;
 use modal::{Modal, Trace, has_fast_pole};
 use std::cell::Cell;
 
@@ -378,7 +378,7 @@ impl<'a> Chain<'a> {
             match stage {
                 Stage::Linear(zpk) => pending = pending.series(&zpk),
                 Stage::Clip(low, high) => x.iter_mut().for_each(|v| *v = v.min(high).max(low)),
-                Stage::Slew(rate) => slew(&mut x, rate, h),
+                Stage::Slew(rate) => slew(&mut x, rate, h, 0.0),
                 Stage::Block(mut block) => {
                     if !pending.poles.is_empty() || !pending.zeros.is_empty() {
                         x = Modal::new(&pending, h).means(&x);

@@ -212,6 +212,7 @@ pub fn record_name(file: &Path) -> String {
 fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Failure> {
     let mut record = of_rows(&record_name(file), &acquired.rows, period_s)?;
     record.exposure_s = acquired.exposure_s;
+    record.slew_um_per_s = acquired.slew_um_per_s;
     Ok(record)
 }
 
@@ -255,10 +256,12 @@ pub fn neutral_um(record: &Record, gain_per_s: f64) -> f64 {
 pub const FRAME_AGE: &str = "frame_age_s";
 /// Column of a record with the exposure of its frames.
 pub const EXPOSURE: &str = "exposure_s";
-
-/// Column of a record: 1 in a stall, in which nobody knows when a row's command acted, else 0.
+/// Column of a record with the largest speed of the displacement that the board allows.
+pub const SLEW: &str = "slew_um_per_s";
+/// Column of a record: 1 where a row's command came half a row late or more, or never, else 0.
 pub const LATE_COMMAND: &str = "late_command";
-/// Column of a record: standard deviation of the motion from the row before that late commands leave open, um.
+/// Column of a record: standard deviation of the motion from the row before that late commands leave open, um; empty where nobody knows
+/// when they acted.
 pub const LATE_MOTION: &str = "late_motion_um";
 /// Column of a record with 1 where a row's frame came, with a bead or without, and 0 where it was dropped.
 pub const FRAME_CAME: &str = "frame_came";
@@ -284,8 +287,10 @@ pub fn write_record(record: &Record, path: &Path) -> Result<(), Failure> {
             .map(|(unseen, bead)| f64::from(u8::from(*unseen || bead.is_finite())));
         more.push((FRAME_CAME.to_owned(), came.collect()));
     }
-    if record.exposure_s > 0.0 {
-        more.push((EXPOSURE.to_owned(), vec![record.exposure_s; record.rows()]));
+    for (name, value) in [(EXPOSURE, record.exposure_s), (SLEW, record.slew_um_per_s)] {
+        if value > 0.0 {
+            more.push((name.to_owned(), vec![value; record.rows()]));
+        }
     }
     let table = cellpos_table::Record {
         start_s: record.start_s,

@@ -9,7 +9,7 @@
 //! to 15 ppm off and stalls now and then. Light and focus differ.
 
 use super::{
-    Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, LATE_MOTION, look, neutral_um,
+    Collecting, EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, LATE_MOTION, SLEW, look, neutral_um,
     refused,
 };
 use crate::experiment::on_rig::OnRig;
@@ -183,6 +183,7 @@ fn kept(folder: &Path) -> Vec<Record> {
             }
             record.late_motion_um = read.column(LATE_MOTION).unwrap_or_default().to_vec();
             record.exposure_s = read.column(EXPOSURE).map_or(0.0, |c| c[0]);
+            record.slew_um_per_s = read.column(SLEW).map_or(0.0, |c| c[0]);
             if let Some(came) = read.column(FRAME_CAME) {
                 record.unseen = (came.iter().zip(&record.bead_um))
                     .map(|(came, bead)| *came == 1.0 && bead.is_nan())

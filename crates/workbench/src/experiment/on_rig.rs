@@ -52,6 +52,8 @@ struct Devices {
     board: String,
     /// As [`Acquired::exposure_s`].
     exposure_s: f64,
+    /// As [`Acquired::slew_um_per_s`].
+    slew_um_per_s: f64,
 }
 
 impl Devices {
@@ -59,6 +61,7 @@ impl Devices {
         Self {
             board: rig.actuator().name,
             exposure_s: connect::known_exposure_s(file, &rig.source()).unwrap_or(0.0),
+            slew_um_per_s: file.limits.slew_um_per_s.min(rig.actuator().slew_um_per_s),
         }
     }
 }
@@ -80,6 +83,8 @@ pub struct Acquired {
     pub out_of_view: Vec<usize>,
     /// Length of an exposure, s; 0 if neither rig file nor camera states it.
     pub exposure_s: f64,
+    /// Largest speed of the displacement that the board allows, um/s.
+    pub slew_um_per_s: f64,
     /// Why segments are missing, if any are.
     pub trouble: Option<Trouble>,
     /// Folder of the run.
@@ -398,6 +403,7 @@ impl OnRig {
             rows: rows.delivered(),
             out_of_view,
             exposure_s: devices.exposure_s,
+            slew_um_per_s: devices.slew_um_per_s,
             trouble: None,
             run: None,
             board: devices.board.clone(),

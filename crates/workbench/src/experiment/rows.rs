@@ -66,9 +66,9 @@ pub struct Delivered {
     pub unseen: Vec<bool>,
     /// From the exposure of each row's frame to its command, s; NaN for a row whose frame did not come in time.
     pub frame_age_s: Vec<f64>,
-    /// Rows whose command came late or never, and nobody knows when.
+    /// Rows whose command came half a row late or more, or never.
     pub late_command: Vec<bool>,
-    /// Standard deviation of the motion to each row that commands leave open which came late at a known time, um.
+    /// Standard deviation of the motion to each row that late commands leave open, um; NaN where nobody knows when they came.
     pub late_motion_um: Vec<f64>,
 }
 
@@ -79,8 +79,10 @@ pub(crate) struct Rows {
     /// Position of each row, um, as if all commands had been on time; NaN without one.
     pub(crate) output: Vec<f64>,
     usable: Vec<bool>,
-    /// When the command of this row came is not known: it was late, or never came.
+    /// The command of this row came half a row late or more, or never: the machine stalled.
     late: Vec<bool>,
+    /// When it came is not known.
+    unknown: Vec<bool>,
     /// Standard deviation of the motion to each row that late commands leave open, um.
     late_motion_um: Vec<f64>,
     /// The frame came too late, or without a reliable bead.
@@ -117,6 +119,7 @@ impl Rows {
             output: Vec::new(),
             usable: Vec::new(),
             late: Vec::new(),
+            unknown: Vec::new(),
             late_motion_um: Vec::new(),
             unseen: Vec::new(),
             without_bead: Vec::new(),
@@ -156,6 +159,7 @@ impl Rows {
                 rows.output.push(f64::NAN);
                 rows.usable.push(true);
                 rows.late.push(true);
+                rows.unknown.push(true);
                 rows.unseen.push(false);
                 rows.without_bead.push(false);
                 rows.repeated.push(false);
@@ -167,9 +171,10 @@ impl Rows {
                 row: row as f64 + late.at_board_ns as f64 / period_ns as f64,
                 um: tick.command_um,
             }));
-            // A command half a period late came in a stall of the machine. When the board had it, only the board can tell.
-            let late = late.filter(|late| late.told || 2 * late.at_board_ns.abs() < period_ns);
-            rows.late[row] = late.is_none();
+            rows.late[row] = late.is_none_or(|late| 2 * late.at_board_ns.abs() >= period_ns);
+            // When the board had a command of a stall, only the board can tell.
+            let late = late.filter(|late| late.told || !rows.late[row]);
+            rows.unknown[row] = late.is_none();
             let seen = new_frame && !has(TickFlags::LOST);
             // The row's command stands as if on time.
             rows.ages_ns[row] =
@@ -194,10 +199,13 @@ impl Rows {
             &rows.input,
             &rows.output,
             &arrivals,
-            &rows.late,
+            &rows.unknown,
             rows.usual_age_periods,
         );
         (rows.output, rows.late_motion_um) = (on_time.position_um, on_time.open_um);
+        let open = rows.late_motion_um.iter_mut().zip(&rows.unknown);
+        open.filter(|(_, unknown)| **unknown)
+            .for_each(|(um, _)| *um = f64::NAN);
         rows
     }
 

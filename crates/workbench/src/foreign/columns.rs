@@ -2,7 +2,7 @@
 
 use super::arrays::read_table;
 use crate::experiment::collect::{
-    EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, LATE_MOTION, record_name, refused,
+    EXPOSURE, FRAME_AGE, FRAME_CAME, LATE_COMMAND, LATE_MOTION, SLEW, record_name, refused,
 };
 use cellpos_numeric::units::Hertz;
 use cellpos_reconcile::Record;
@@ -68,7 +68,7 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
     };
     // What a loop knows of its frames stands beside position and command.
     let beside = |name: &str| table.numbers_or_nan(&ColumnRef::from(name)).ok();
-    let (mut age, exposure) = (beside(FRAME_AGE).unwrap_or_default(), beside(EXPOSURE));
+    let mut age = beside(FRAME_AGE).unwrap_or_default();
     let mut came = beside(FRAME_CAME).unwrap_or_default();
     let mut late = beside(LATE_COMMAND).unwrap_or_default();
     let mut late_motion = beside(LATE_MOTION).unwrap_or_default();
@@ -117,21 +117,19 @@ pub fn read(path: &Path, wanted: &Wanted<'_>) -> Result<Record, Failure> {
             record.late_command = late.iter().map(|late| *late == 1.0).collect();
         }
         record.late_motion_um = in_rows(&record, &t, &late_motion);
-        (record.late_motion_um.iter_mut()).for_each(|um| {
-            *um = if um.is_finite() {
-                *um * wanted.factors[1]
-            } else {
-                0.0
-            }
-        });
+        (record.late_motion_um.iter_mut()).for_each(|um| *um *= wanted.factors[1]);
         let came = in_rows(&record, &t, &came);
         if !came.is_empty() {
             record.unseen = (came.iter().zip(&record.bead_um))
                 .map(|(came, bead)| *came == 1.0 && bead.is_nan())
                 .collect();
         }
-        let exposure = exposure.iter().flatten().find(|s| s.is_finite());
-        record.exposure_s = exposure.map_or(0.0, |s| s.max(0.0));
+        let constant = |name: &str| {
+            let known = beside(name)?.into_iter().find(|value| value.is_finite());
+            known.filter(|value| *value > 0.0)
+        };
+        record.exposure_s = constant(EXPOSURE).unwrap_or(0.0);
+        record.slew_um_per_s = constant(SLEW).unwrap_or(0.0) * wanted.factors[0];
     }
     Ok(record)
 }

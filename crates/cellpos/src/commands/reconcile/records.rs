@@ -155,6 +155,7 @@ pub(super) fn read_run(path: &Path, run: &RunReader) -> Result<(Record, Option<f
             .map_err(refused)?
     };
     read.exposure_s = run.meta().map_or(0.0, exposure_s);
+    read.slew_um_per_s = run.meta().map_or(0.0, slew_um_per_s);
     // Where the bead of a closed loop rested: the mean of what was commanded while the loop ran, um.
     let held = ticks.iter().filter(|tick| held(tick));
     let (sum_um, count) = held.fold((0.0, 0_usize), |(sum, count), tick| {
@@ -164,12 +165,27 @@ pub(super) fn read_run(path: &Path, run: &RunReader) -> Result<(Record, Option<f
     Ok((read, (count >= 1000).then(|| sum_um / count as f64)))
 }
 
+/// A number in run.toml: the table, and the keys on the way to it.
+fn number(table: &toml::Table, path: &[&str]) -> Option<f64> {
+    let (first, rest) = path.split_first()?;
+    let value = rest
+        .iter()
+        .try_fold(table.get(*first)?, |value, key| value.get(key))?;
+    value.as_float()
+}
+
 /// Exposure of a run's frames as its loop knew it, s; 0 if it did not.
 fn exposure_s(meta: &RunMeta) -> f64 {
-    let table = |table: &toml::Table, key: &str| table.get(key)?.as_table().cloned();
-    let estimator = table(&meta.config, "controller").and_then(|c| table(&c, "estimator"));
-    let ms = estimator.and_then(|e| e.get("exposure_ms")?.as_float());
+    let ms = number(&meta.controller, &["estimator", "exposure_ms"]);
     ms.map_or(0.0, |ms| 1e-3 * ms.max(0.0))
+}
+
+/// Largest speed of the displacement that a run's board allowed, um/s; 0 if run.toml does not say.
+fn slew_um_per_s(meta: &RunMeta) -> f64 {
+    let rigs = number(&meta.config, &["rig", "limits", "slew_um_per_s"]);
+    let boards = number(&meta.conditions, &["actuator", "slew_um_per_s"]);
+    let known = [rigs, boards].into_iter().flatten();
+    known.reduce(f64::min).unwrap_or(0.0).max(0.0)
 }
 
 /// Whether the loop ran in a tick.
@@ -248,4 +264,21 @@ pub(super) fn fitted(records: &[Record]) -> Result<Model, Failure> {
         noise: Noise::NONE,
         ..Model::eq6()
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_says_how_long_its_frames_were_exposed_and_how_fast_its_board_may_be() {
+        let mut meta = RunMeta::new("r", "real");
+        assert_eq!((exposure_s(&meta), slew_um_per_s(&meta)), (0.0, 0.0));
+        let table = |text: &str| toml::from_str::<toml::Table>(text).expect("TOML");
+        meta.controller = table("[estimator]\nexposure_ms = 0.5\n");
+        meta.config = table("[rig.limits]\nslew_um_per_s = 20000.0\n");
+        assert_eq!((exposure_s(&meta), slew_um_per_s(&meta)), (5e-4, 20_000.0));
+        meta.conditions = table("[actuator]\nslew_um_per_s = 5000.0\n");
+        assert_eq!(slew_um_per_s(&meta), 5000.0);
+    }
 }
