@@ -25,7 +25,7 @@ pub struct Order {
     pub action: Action,
     /// Command for the slow partner, um of its own scale, if one is due.
     pub partner_um: Option<f64>,
-    /// Hand-over since the start of the run, us.
+    /// Start of its tick since the start of the run, us.
     pub time_us: u64,
 }
 
@@ -399,13 +399,14 @@ impl<R: ReferenceGenerator> Ticker<R> {
             host_us: report.last_time_us,
             board_us: report.device_time_us,
         };
+        // Later reports of one command tell nothing of its way.
+        if self.obeyed.is_some_and(|before| before.seq == seq) {
+            return;
+        }
         let Some(before) = self.obeyed.replace(obeyed) else {
             self.slowest = Some(obeyed);
             return;
         };
-        if before.seq == seq {
-            return;
-        }
         let host = obeyed.host_us.saturating_sub(before.host_us);
         let board = obeyed.board_us.saturating_sub(before.board_us);
         let off_ns = host.abs_diff(board).saturating_mul(1000);

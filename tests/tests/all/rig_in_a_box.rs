@@ -112,6 +112,20 @@ fn a_bead_is_held_over_a_pseudo_terminal_and_a_socket_and_the_pzt_is_parked_afte
     );
     assert!(median_nm < 150.0, "{median_nm} nm: {r}");
     assert!(r["frames_lost"].as_f64().unwrap() > 0.0, "{r}");
+    let (ticks, _) = RunReader::open(&run_folder(folder.path()).unwrap())
+        .unwrap()
+        .ticks()
+        .unwrap();
+    let told: Vec<_> = (ticks.iter())
+        .filter(|tick| tick.obeyed_at_us.is_finite())
+        .collect();
+    // The board answers each command, and never before it was given.
+    assert!(2 * told.len() > ticks.len(), "{} reports", told.len());
+    assert!(told.iter().all(|tick| tick.obeyed_before_us > 0.0));
+    assert!(
+        told.windows(2)
+            .all(|pair| pair[0].obeyed_at_us < pair[1].obeyed_at_us)
+    );
     let last = rows.last().unwrap();
     assert!((last.applied_um - PARK_UM).abs() < 0.01, "{last:?}");
     let held = rows.iter().filter(|row| row.state == "Running");
