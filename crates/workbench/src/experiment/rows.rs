@@ -68,7 +68,8 @@ pub struct Delivered {
     pub frame_age_s: Vec<f64>,
     /// Rows whose command came half a row late or more, or never.
     pub late_command: Vec<bool>,
-    /// Standard deviation of the motion to each row that late commands leave open, um; NaN where nobody knows when they came.
+    /// Standard deviation of the motion to each row that late commands leave open, um; NaN where nobody knows when they came, empty if
+    /// none was late.
     pub late_motion_um: Vec<f64>,
 }
 
@@ -206,6 +207,9 @@ impl Rows {
         let open = rows.late_motion_um.iter_mut().zip(&rows.unknown);
         open.filter(|(_, unknown)| **unknown)
             .for_each(|(um, _)| *um = f64::NAN);
+        if rows.late_motion_um.iter().all(|um| *um == 0.0) {
+            rows.late_motion_um.clear();
+        }
         rows
     }
 
