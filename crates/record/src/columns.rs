@@ -59,16 +59,19 @@ pub enum Group {
     Script,
     /// The slow partner of the PZT: rigs that have one.
     Partner,
+    /// When the board had its commands: the real clock.
+    Line,
 }
 
 /// All groups.
-pub(crate) const GROUPS: [Group; 6] = [
+pub(crate) const GROUPS: [Group; 7] = [
     Group::Loop,
     Group::Cell,
     Group::Truth,
     Group::Solver,
     Group::Script,
     Group::Partner,
+    Group::Line,
 ];
 
 /// A column of `ticks.arrow`.
@@ -169,8 +172,8 @@ columns! {
     partner_applied_um F64 Partner,
     partner_effect_um F64 Partner,
     partner U8 Partner,
-    obeyed_before_us F64 Loop,
-    obeyed_at_us F64 Loop,
+    obeyed_before_us F64 Line,
+    obeyed_at_us F64 Line,
 }
 
 /// Name of the last column of the file: CRC-32 of the values before it in the row, each in its own width, little-endian. It is
@@ -356,10 +359,10 @@ mod tests {
         for column in COLUMNS {
             let name = column.name;
             let number = column.kind == Kind::F64;
-            assert!(
-                !number || name.ends_with("_um") || name.ends_with("_um2"),
-                "{name}"
-            );
+            let unit = ["_um", "_um2", "_us"]
+                .iter()
+                .any(|unit| name.ends_with(unit));
+            assert!(!number || unit, "{name}");
         }
     }
 

@@ -35,7 +35,7 @@ pub fn meta(
         ClockKind::Virtual => "virtual",
     };
     let mut meta = RunMeta::new(name, clock);
-    meta.columns = columns(setup, file);
+    meta.columns = columns(setup, file, !rig.clock().is_virtual());
     meta.command_line = provenance::command_line();
     // Run even if the folder is gone.
     meta.started_in =
@@ -76,7 +76,7 @@ pub fn meta(
 }
 
 /// The columns that a run needs. A quantity that is neither measured nor computed takes no room on the disk.
-fn columns(setup: &Setup, file: &RigFile) -> Vec<Group> {
+fn columns(setup: &Setup, file: &RigFile, real_time: bool) -> Vec<Group> {
     let mpc = setup.controller.controller == ControllerKind::Mpc;
     let script = matches!(setup.config.reference, ReferenceSpec::Script { .. });
     let real = matches!(file.camera, CameraConfig::Industrial { .. });
@@ -87,6 +87,7 @@ fn columns(setup: &Setup, file: &RigFile) -> Vec<Group> {
         (Group::Solver, mpc),
         (Group::Script, script),
         (Group::Partner, file.partner.is_some()),
+        (Group::Line, real_time),
     ]
     .into_iter()
     .filter_map(|(group, wanted)| wanted.then_some(group))
