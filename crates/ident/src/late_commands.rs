@@ -241,8 +241,8 @@ impl<I: Iterator<Item = Arrival>> Integral<I> {
 pub struct OnTime {
     /// Position of each row, um; NaN without a bead.
     pub position_um: Vec<f64>,
-    /// Standard deviation of the motion to each row from the row before, in what the position was moved by, um: the chip need not be
-    /// linear, as this estimate is. Empty if the rows do not tell how a command moves the bead.
+    /// Standard deviation of the correction of each row's motion from the row before, um. The correction is linear, and the chip need
+    /// not be. Empty if the rows do not tell how a command moves the bead.
     pub open_um: Vec<f64>,
 }
 
@@ -310,8 +310,8 @@ pub fn as_if_on_time(
     }
 }
 
-/// What the linear motion leaves of the increments of the position, RMS, over the RMS of that motion's own: an upper limit of the part by
-/// which the chip is not as linear as it is, because it contains the noise.
+/// RMS of the increments of the position that the linear motion leaves, over the RMS of its own. The share of the chip that is not linear
+/// is smaller, because the noise is in it.
 fn left_share(position_um: &[f64], due_um: &[f64], late: &[bool]) -> f64 {
     let all = vec![0.0; position_um.len()];
     let squares = |less: &[f64]| -> f64 {

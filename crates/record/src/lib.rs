@@ -65,7 +65,7 @@ pub use export::{TableColumn, write_parquet, write_table_parquet};
 pub use faults::Faults;
 pub use follow::Follow;
 pub use lines::{LineFile, whole_text};
-pub use meta::{InputFile, RunEnd, RunMeta};
+pub use meta::{InputFile, RunEnd, RunMeta, number_at};
 pub use reader::{Batches, Gap, Lost, RunReader};
 pub use sessions::Sessions;
 pub use writer::{Finished, FlushPolicy, RunWriter, check_name};

@@ -157,6 +157,21 @@ pub struct RunMeta {
     pub end: Option<RunEnd>,
 }
 
+/// A value deep in a table of run.toml, by the keys on the way to it.
+pub(crate) fn value_at<'a>(table: &'a toml::Table, keys: &[&str]) -> Option<&'a toml::Value> {
+    let (first, rest) = keys.split_first()?;
+    rest.iter()
+        .try_fold(table.get(*first)?, |value, key| value.get(*key))
+}
+
+/// The same, of a number.
+pub fn number_at(table: &toml::Table, keys: &[&str]) -> Option<f64> {
+    let value = value_at(table, keys)?;
+    value
+        .as_float()
+        .or_else(|| value.as_integer().map(|whole| whole as f64))
+}
+
 fn all_groups() -> Vec<Group> {
     GROUPS.to_vec()
 }

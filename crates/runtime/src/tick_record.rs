@@ -165,8 +165,8 @@ pub struct TickRecord {
     pub wake_ns: u32,
     /// From the start of the tick to the hand-over of the command, ns; 0 on the virtual clock.
     pub compute_ns: u32,
-    /// From the start of the tick whose command the board has reported since the previous tick to the start of this one, us; of several
-    /// commands the one that was longest on its way. NaN without a new one.
+    /// Age of a command that the board has reported since the previous tick, from the start of the command's tick to the start of this
+    /// one, us. Of several commands it is the one that was longest on its way. NaN without a new one.
     pub obeyed_before_us: f64,
     /// The board's clock when it had that command, us. Only differences tell: its zero is the board's.
     pub obeyed_at_us: f64,

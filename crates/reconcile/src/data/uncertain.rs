@@ -53,8 +53,8 @@ fn add_guessed(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
     }
 }
 
-/// While a command does not act, and nobody knows for how long, the PZT is anywhere that commands were: where it was before, or where the board holds the bead. It shows in
-/// the frames until that of the next row, and these are as old as the record says.
+/// Of some commands nobody knows when they acted. Until then the PZT is anywhere that commands were: where it was before, or where the
+/// board holds the bead. It shows in the frames until that of the next row, and these are as old as the record says.
 fn add_late(r: &Record, gain_per_sample: f64, extra: &mut [f64]) {
     let rows = r.rows() as f64;
     let mean_um = r.pzt_um.iter().sum::<f64>() / rows;

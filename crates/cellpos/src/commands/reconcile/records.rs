@@ -4,7 +4,7 @@ use crate::outcome::Failure;
 use cellpos_plant::effects;
 use cellpos_plant::{Hertz, Model, Noise, TransferFunction};
 use cellpos_reconcile::Record;
-use cellpos_record::{RunMeta, RunReader};
+use cellpos_record::{RunMeta, RunReader, number_at};
 use cellpos_runtime::TickRecord;
 use cellpos_session::sessions;
 use cellpos_workbench::experiment::collect::{neutral_um, of_ticks, record_name, refused};
@@ -165,25 +165,16 @@ pub(super) fn read_run(path: &Path, run: &RunReader) -> Result<(Record, Option<f
     Ok((read, (count >= 1000).then(|| sum_um / count as f64)))
 }
 
-/// A number in run.toml: the table, and the keys on the way to it.
-fn number(table: &toml::Table, path: &[&str]) -> Option<f64> {
-    let (first, rest) = path.split_first()?;
-    let value = rest
-        .iter()
-        .try_fold(table.get(*first)?, |value, key| value.get(key))?;
-    value.as_float()
-}
-
 /// Exposure of a run's frames as its loop knew it, s; 0 if it did not.
 fn exposure_s(meta: &RunMeta) -> f64 {
-    let ms = number(&meta.controller, &["estimator", "exposure_ms"]);
+    let ms = number_at(&meta.controller, &["estimator", "exposure_ms"]);
     ms.map_or(0.0, |ms| 1e-3 * ms.max(0.0))
 }
 
 /// Largest speed of the displacement that a run's board allowed, um/s; 0 if run.toml does not say.
 fn slew_um_per_s(meta: &RunMeta) -> f64 {
-    let rigs = number(&meta.config, &["rig", "limits", "slew_um_per_s"]);
-    let boards = number(&meta.conditions, &["actuator", "slew_um_per_s"]);
+    let rigs = number_at(&meta.config, &["rig", "limits", "slew_um_per_s"]);
+    let boards = number_at(&meta.conditions, &["actuator", "slew_um_per_s"]);
     let known = [rigs, boards].into_iter().flatten();
     known.reduce(f64::min).unwrap_or(0.0).max(0.0)
 }

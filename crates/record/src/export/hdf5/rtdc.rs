@@ -7,7 +7,7 @@ use super::{CHUNK, LEVEL, encode};
 use crate::error::RecordError;
 use crate::export::columns::Row;
 use crate::export::{Exported, Selection, Source, part_of, seconds, settle};
-use crate::meta::RunMeta;
+use crate::meta::{RunMeta, number_at, value_at};
 use hdf5_pure::{AttrValue, File, FileAccessProperties, FileBuilder, MaxExtent, SyncPolicy};
 use std::path::Path;
 
@@ -173,25 +173,11 @@ fn empty(source: &Source, all: &Events, path: &Path) -> Result<(), RecordError> 
     builder.write(path).map_err(|error| encode(&error))
 }
 
-/// A value deep in a table.
-fn at<'a>(table: &'a toml::Table, keys: &[&str]) -> Option<&'a toml::Value> {
-    let (first, rest) = keys.split_first()?;
-    rest.iter()
-        .try_fold(table.get(*first)?, |value, key| value.get(*key))
-}
-
-fn number(table: &toml::Table, keys: &[&str]) -> Option<f64> {
-    let value = at(table, keys)?;
-    value
-        .as_float()
-        .or_else(|| value.as_integer().map(|whole| whole as f64))
-}
-
 /// The format's required data of a measurement.
 fn attributes(meta: &RunMeta, all: &Events) -> Result<Vec<(&'static str, AttrValue)>, RecordError> {
     let config = &meta.config;
     let text = |key: &str| {
-        at(config, &["rig", "sample", key])
+        value_at(config, &["rig", "sample", key])
             .and_then(toml::Value::as_str)
             .ok_or_else(|| {
                 refused(&format!(
@@ -201,18 +187,18 @@ fn attributes(meta: &RunMeta, all: &Events) -> Result<Vec<(&'static str, AttrVal
     };
     let string = |text: &str| AttrValue::String(text.to_owned());
     let whole = |value: f64| AttrValue::I64(value as i64);
-    let width_um = number(config, &["rig", "sample", "channel_width_um"]).ok_or_else(|| {
+    let width_um = number_at(config, &["rig", "sample", "channel_width_um"]).ok_or_else(|| {
         refused("the format asks for `channel_width_um`: say it in the table [sample] of rig.toml")
     })?;
-    let emulator = |key: &str| number(config, &["rig", "emulator", key]);
-    let camera = |key: &str| number(config, &["rig", "camera", key]);
-    let pixel_um = number(config, &["rig", "calibration", "pixel_um"])
+    let emulator = |key: &str| number_at(config, &["rig", "emulator", key]);
+    let camera = |key: &str| number_at(config, &["rig", "camera", key]);
+    let pixel_um = number_at(config, &["rig", "calibration", "pixel_um"])
         .or_else(|| emulator("pixel_um"))
         .ok_or_else(|| refused("run.toml does not say how large a pixel is"))?;
-    let emulated =
-        at(config, &["rig", "camera", "kind"]).and_then(toml::Value::as_str) == Some("emulated");
+    let emulated = value_at(config, &["rig", "camera", "kind"]).and_then(toml::Value::as_str)
+        == Some("emulated");
     let region = |place: usize| {
-        at(config, &["rig", "camera", "region"])
+        value_at(config, &["rig", "camera", "region"])
             .and_then(|region| region.get(place))
             .and_then(toml::Value::as_integer)
             .map(|px| px as f64)
