@@ -251,10 +251,6 @@ impl EffectKind for PztHysteresis {
         Ok(())
     }
 
-    fn has_two_gains(&self) -> bool {
-        true
-    }
-
     fn memoryless(&self) -> Option<usize> {
         CANDIDATES.iter().position(|c| c.name == "curvature")
     }

@@ -60,6 +60,40 @@ impl Tangents {
     }
 }
 
+impl Tangents {
+    /// These with further columns by record, each with a prior of standard deviation 1.
+    pub(crate) fn with_priors(
+        mut self,
+        further: &[Vec<Vec<f64>>],
+        e: &[Vec<f64>],
+        mask: &Mask,
+    ) -> Self {
+        let free = self.gradient.len();
+        let count = free + further.iter().map(Vec::len).max().unwrap_or(0);
+        for (columns, further) in self.columns.iter_mut().zip(further) {
+            columns.extend((free..).zip(further.iter().cloned()));
+        }
+        let (mut normal, gradient) = normal_equations(count, &self.columns, e, mask);
+        for i in 0..count {
+            let own = normal[(i, i)];
+            normal[(i, i)] += match i < free {
+                true if own == 0.0 => 1.0,
+                true => 1e-9 * own,
+                false => 1.0,
+            };
+        }
+        let inverse = normal.try_inverse();
+        self.inverse = inverse.unwrap_or_else(|| DMatrix::identity(count, count));
+        self.gradient = gradient;
+        self
+    }
+
+    /// Fall of the sum of squares by the best step along all columns, to the first order.
+    pub(crate) fn gain_of_all(&self) -> f64 {
+        self.gradient.dot(&(&self.inverse * &self.gradient))
+    }
+}
+
 /// Sum of squares under a mask.
 pub(crate) fn sum_squares(e: &[Vec<f64>], mask: &Mask) -> f64 {
     e.iter()

@@ -2,12 +2,13 @@
 
 use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
+use crate::fit::form_error::{FormError, SHARE};
 use crate::search::cost::{leaves_much, left_over, scatter};
 use crate::search::sequential::ids;
 use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;
 use crate::verdict::battery::{self, Column, Hypothesis};
-use crate::verdict::form::Aside;
+use crate::verdict::curve::Aside;
 use crate::verdict::held_out::HeldOut;
 use crate::verdict::hidden;
 use crate::verdict::map::DiscrepancyMap;
@@ -37,7 +38,7 @@ pub(crate) struct Evidence<'a> {
     pub unweighed: bool,
     /// What is said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
-    /// What was taken out of the names as another form of the others.
+    /// What was taken out of the names as no more than a curve.
     pub aside: &'a Aside,
 }
 
@@ -67,10 +68,13 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let gained = (excess - left).max(0.0);
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
+    // What the equations of the set leave if the rig has others.
+    let of_form = FormError::of(ctx, e.fit, &all, threads).takes_off(ctx, e.fit, &all);
+    let of_form = if excess > 0.0 { of_form / excess } else { 0.0 };
     let much = leaves_much(e.null, e.fit);
     let beyond_chance = much || term.is_some();
-    let mut companions = e.aside.companions.iter();
-    let remains = beyond_chance || companions.any(|(_, share)| *share > THRESHOLDS.term_share);
+    let mut curved = e.aside.curved.iter();
+    let remains = beyond_chance || curved.any(|(_, share)| *share > THRESHOLDS.term_share);
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
         reasons: Vec::new(),
@@ -82,7 +86,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         without_effects(ctx, e, (&library, term), beyond, threads, &mut out);
         return out;
     }
-    // Numbers of an equation that is off in its form differ a little from record to record; with the companions they must not.
+    // What was set aside is another form of what is named.
     let whole = e.aside.whole.as_ref().unwrap_or(e.fit);
     let refused = refusal(ctx, e, closed, left > THRESHOLDS.left_sd * scatter);
     let moved = match refused {
@@ -107,8 +111,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         (false, true) => THRESHOLDS.closed_whole,
         (false, false) => THRESHOLDS.remainder_closed,
     };
-    // What was set aside is another form of what is named.
-    if beyond_chance && closed.max(closed_by(whole)) < least {
+    if beyond_chance && (closed + of_form).max(closed_by(whole)) < least {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",
@@ -126,7 +129,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         Verdict::Named
     };
     if remains {
-        let mut left = remainder(ctx, e, &library, term, 1.0 - closed);
+        let mut left = remainder(ctx, e, (&library, term), (1.0 - closed, of_form));
         if let Some(moved) = moved {
             left.how = format!("{}; {}", moved.words, left.how);
         }
@@ -156,7 +159,7 @@ fn without_effects(
     } else if beyond && e.counted {
         // Missing frames are counted, whatever the rest is.
         out.verdict = Verdict::NamedWithRemainder;
-        out.remainder = Some(remainder(ctx, e, library, term, 1.0));
+        out.remainder = Some(remainder(ctx, e, (library, term), (1.0, 0.0)));
     } else if beyond {
         out.verdict = Verdict::Unknown;
         out.reasons
@@ -359,25 +362,31 @@ fn describe(
     out.hypothesis = battery::hypothesis(ctx, fit, library);
 }
 
-/// The remainder next to the names.
+/// The remainder next to the names: a share of the gap, `of_form` of it no more than what other equations of the names would explain.
 fn remainder(
     ctx: &Context<'_>,
     e: &Evidence<'_>,
-    library: &[Column],
-    term: Option<(usize, f64)>,
-    share: f64,
+    (library, term): (&[Column], Option<(usize, f64)>),
+    (share, of_form): (f64, f64),
 ) -> Remainder {
     let mut how: Vec<String> = e
         .aside
-        .companions
+        .curved
         .iter()
         .map(|(id, share)| {
             format!(
-                "{:.2} % of the gap that {id} beside it would explain, and another form of the named effect as well",
+                "{:.2} % of the gap that {id} beside it would explain, and a curve without memory as well",
                 100.0 * share
             )
         })
         .collect();
+    if of_form > 0.5 * share {
+        how.push(format!(
+            "{:.2} % of the gap is what equations that differ by {:.0} % from those of the names would explain",
+            100.0 * of_form,
+            100.0 * SHARE
+        ));
+    }
     how.extend(term.map(|(i, _)| {
         format!(
             "{} ({} at the {})",

@@ -208,9 +208,9 @@ pub fn record_name(file: &Path) -> String {
     )
 }
 
-/// A run as a record.
+/// A run as a record, since the bead was caught.
 fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Failure> {
-    let mut record = of_rows(&record_name(file), &acquired.rows, period_s)?;
+    let mut record = of_rows(&record_name(file), &acquired.rows.since_caught(), period_s)?;
     record.exposure_s = acquired.exposure_s;
     record.slew_um_per_s = acquired.slew_um_per_s;
     Ok(record)

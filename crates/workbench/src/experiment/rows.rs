@@ -73,6 +73,25 @@ pub struct Delivered {
     pub late_motion_um: Vec<f64>,
 }
 
+impl Delivered {
+    /// The rows without the first ones, in which the loop brings the bead to its target: the commands are larger than any of the experiment,
+    /// and what the board did before is not known.
+    pub(crate) fn since_caught(&self) -> Self {
+        const CAUGHT: usize = SETTLE_TICKS / 2;
+        fn tail<T: Copy>(all: &[T]) -> Vec<T> {
+            all.iter().skip(CAUGHT).copied().collect()
+        }
+        Self {
+            pzt_um: tail(&self.pzt_um),
+            bead_um: tail(&self.bead_um),
+            unseen: tail(&self.unseen),
+            frame_age_s: tail(&self.frame_age_s),
+            late_command: tail(&self.late_command),
+            late_motion_um: tail(&self.late_motion_um),
+        }
+    }
+}
+
 /// Ticks as rows of an evenly sampled record, by frame id: a tick that never came is a row without a position.
 pub(crate) struct Rows {
     /// Command of each row, um.

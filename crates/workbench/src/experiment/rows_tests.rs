@@ -279,6 +279,15 @@ fn a_picture_that_came_twice_repeats_its_position_for_who_counts_faults_of_the_c
 }
 
 #[test]
+fn a_record_of_an_experiment_begins_when_the_bead_was_caught() {
+    let all = Rows::of(&ticks(10.0, 2000, &CALM), PERIOD_NS).delivered();
+    let since = all.since_caught();
+    assert_eq!(since.pzt_um[..], all.pzt_um[250..]);
+    assert_eq!(since.bead_um.len(), 1750);
+    assert_eq!(since.late_motion_um.is_empty(), all.late_motion_um.is_empty());
+}
+
+#[test]
 fn a_segment_that_lost_half_of_its_steps_is_measured_again_and_one_that_lost_a_tenth_is_not() {
     for (every, is_whole) in [(20, true), (4, false)] {
         let mut ticks = ticks(10.0, 2000, &CALM);
