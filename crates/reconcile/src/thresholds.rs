@@ -19,6 +19,11 @@ pub struct Thresholds {
     /// Factor, for the error of the noise estimate, on the least gain of an addition in twice the log-likelihood. That gain is the
     /// quantile of chi-square with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
+    /// Part of an effect's response by which its equation may differ from the rig's, as a standard deviation. What such a difference can look
+    /// like is no evidence for another effect. The second equations of the tests' simulator differ by so much (`reconcile-table seconds`).
+    /// Pinned by `a_small_effect_that_another_form_of_the_large_one_explains_is_no_name` and
+    /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
+    pub form_error: f64,
     /// Rivals closer than this in twice the log-likelihood count as equal to the winner: e^5 to 1. Pinned by
     /// `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
     pub tie: f64,
@@ -109,6 +114,7 @@ pub struct Thresholds {
 /// The numbers in use.
 pub const THRESHOLDS: Thresholds = Thresholds {
     addition_noise: 1.3,
+    form_error: 0.1,
     tie: 10.0,
     closed_least: 0.80,
     closed_whole: 0.985,

@@ -5,7 +5,9 @@ use crate::fit::position_error::Locking;
 use crate::mask::Mask;
 use crate::problem::{Prepared, Problem};
 use crate::simulate::{Base, Effect, Input, Place, simulate};
+use crate::thresholds::THRESHOLDS;
 use crate::units::Scales;
+use cellpos_plant::Model;
 use cellpos_plant::effects::{Action, Candidate, Role, Scope, find};
 use nalgebra::DMatrix;
 
@@ -46,6 +48,32 @@ pub(crate) struct WhiteEvidence {
 }
 
 impl WhiteEvidence {
+    /// What the noise of a problem says, if `trusted` increments told it.
+    pub(crate) fn of(model: &Model, trusted: usize, problem: &Problem) -> Option<Self> {
+        let noise = &problem.noise;
+        let exposure_s = problem
+            .records
+            .first()
+            .map_or(0.0, |r| r.sampling.exposure_s);
+        let model_um2 = model.noise.localisation_um.powi(2);
+        if trusted < 5000 || model_um2 <= 0.0 || noise.coloured.is_some() {
+            return None;
+        }
+        let variance = noise.walk_um2 + 2.0 * noise.white_um2;
+        // Only where the walk is that of the model: else the model's noise says nothing about this rig.
+        let walk = 2.0 * model.noise.diffusion_um2_per_s * problem.base.sample_s;
+        if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > THRESHOLDS.walk_alike {
+            return None;
+        }
+        Some(Self {
+            estimate_um2: noise.white_um2,
+            error_um2: 1.5 * variance / (trusted as f64).sqrt(),
+            // A known exposure averages a part of the walk off, as [`NoiseModel::from_increments`] says.
+            model_um2: model_um2 - noise.walk_um2 * exposure_s / (6.0 * problem.base.sample_s),
+            walk_um2: noise.walk_um2,
+        })
+    }
+
     /// Squared distance, in standard deviations, between the estimate and the value that a set of parts predicts.
     pub(crate) fn distance(&self, parts: &[Part], scope: &Scope) -> f64 {
         let exposure_s: f64 = parts.iter().map(|p| p.averages_s(scope)).sum();

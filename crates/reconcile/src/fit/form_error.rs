@@ -2,7 +2,7 @@
 //!
 //! The catalogue has one equation for an effect, and a rig another. Their difference is small compared with the effect, and looks like a
 //! little of something else: a knee like a gain, a drag like a slew limit. So it is part of the covariance of the residuals. Of each effect
-//! k of a set that covariance has the term `(SHARE a_k)^2 F_k F_k'`: `a_k` is the size of the effect's response, and the columns of `F_k`
+//! k of a set that covariance has the term `(s a_k)^2 F_k F_k'`: `s` is [`crate::thresholds::Thresholds::form_error`], `a_k` is the size of the effect's response, and the columns of `F_k`
 //! are what such a difference can look like. These are
 //!
 //! - the effect's numbers varying with command, position, speed and time, at the output and where they act; spread about their values;
@@ -16,11 +16,10 @@ use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit};
 use crate::fit::linear::{Tangents, sum_squares};
 use crate::mask::Mask;
+use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::{Action, Role};
 use nalgebra::{DMatrix, SymmetricEigen};
 
-/// Part of an effect's response by which its equation may differ from the rig's, as a standard deviation.
-pub(crate) const SHARE: f64 = 0.1;
 /// Time constants of the slower parts, in rows: up to a decade beyond the memory of the effect.
 const SMOOTH_ROWS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 /// How far numbers are spread, in parts of themselves.
@@ -60,7 +59,11 @@ impl FormError {
             return error;
         }
         let sim = ctx.simulated(&fit.parts, fit.offset_um, mask);
-        let others: usize = ctx.variants.iter().map(|v| v.candidate().params.len()).sum();
+        let others: usize = ctx
+            .variants
+            .iter()
+            .map(|v| v.candidate().params.len())
+            .sum();
         let of_part = cellpos_numeric::parallel::map(&parts, threads, |&k| {
             let size = size_of(ctx, fit, (k, &sim), mask);
             let columns = freer(ctx, fit, (k, &sim), mask);
@@ -68,7 +71,7 @@ impl FormError {
         });
         for (size, columns) in of_part {
             let count = columns.iter().map(Vec::len).max().unwrap_or(0);
-            let each = SHARE * SHARE * size / (count + others) as f64;
+            let each = THRESHOLDS.form_error.powi(2) * size / (count + others) as f64;
             error.whole += each * (count + others) as f64;
             error.along_others += each;
             for column in 0..count {
@@ -332,5 +335,29 @@ mod tests {
             moved |= a[21..] != b[21..];
         }
         assert!(moved);
+    }
+
+    #[test]
+    fn principal_directions_have_the_covariance_of_the_columns_without_what_is_below_the_noise() {
+        let mask: Mask = vec![
+            std::iter::once(0..2).collect(),
+            std::iter::once(0..1).collect(),
+        ];
+        // The first two columns are nearly one; the third is small.
+        let columns = vec![
+            vec![vec![3.0, 1.0], vec![3.0, 1.0 + 1e-3], vec![1e-2, -3e-2]],
+            vec![vec![2.0], vec![2.0], vec![1e-2]],
+        ];
+        let kept = principal(&columns, &mask);
+        assert_eq!(kept[0].len(), 1);
+        let all = |c: &[Vec<Vec<f64>>], k: usize| [c[0][k][0], c[0][k][1], c[1][k][0]];
+        for i in 0..3 {
+            for j in 0..3 {
+                let of = |c: &[Vec<Vec<f64>>]| -> f64 {
+                    (0..c[0].len()).map(|k| all(c, k)[i] * all(c, k)[j]).sum()
+                };
+                assert!((of(&kept) - of(&columns)).abs() < 5e-3, "{i} {j}");
+            }
+        }
     }
 }

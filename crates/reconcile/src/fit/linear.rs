@@ -186,4 +186,29 @@ mod tests {
         assert!((at(&columns, 0, [12.5, 1.0]) - 12.5).abs() < 1e-12);
         assert!((at(&columns, 1, [12.5, 1.0]) - 3.0).abs() < 1e-12);
     }
+
+    #[test]
+    fn a_direction_gains_what_it_does_with_the_priors_in_the_covariance() {
+        let mask: Mask = vec![std::iter::once(0..3).collect()];
+        let (e, v) = ([1.0, -2.0, 0.5], [0.3, 1.0, 2.0]);
+        let errors = [vec![2.0, 1.0, 0.0], vec![0.0, 0.5, -1.0]];
+        let none = Tangents {
+            columns: vec![Vec::new()],
+            inverse: DMatrix::zeros(0, 0),
+            gradient: DVector::zeros(0),
+        };
+        let innovations = [e.to_vec()];
+        let beside = none.with_priors(&[errors.to_vec()], &innovations, &mask);
+        let covariance = DMatrix::from_fn(3, 3, |i, j| {
+            f64::from(u8::from(i == j)) + errors.iter().map(|d| d[i] * d[j]).sum::<f64>()
+        });
+        let weight = covariance.try_inverse().expect("a covariance");
+        let [e_, v_] = [e, v].map(|x| DVector::from_row_slice(&x));
+        let of = |a: &DVector<f64>, b: &DVector<f64>| a.dot(&(&weight * b));
+        let taken_off = e_.dot(&e_) - of(&e_, &e_);
+        assert!((beside.gain_of_all() - taken_off).abs() < 1e-12);
+        let gain = beside.gain(&[v.to_vec()], &innovations, &mask);
+        assert!((gain.score - of(&v_, &e_).powi(2) / of(&v_, &v_)).abs() < 1e-12);
+        assert!((gain.own - of(&v_, &v_)).abs() < 1e-12);
+    }
 }

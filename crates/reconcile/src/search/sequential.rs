@@ -5,9 +5,7 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::fit::form_error::FormError;
 use crate::mask::Mask;
-use crate::search::cost::{
-    gap, leaves_much, left_over, penalised_cost, threshold, threshold_of,
-};
+use crate::search::cost::{gap, leaves_much, left_over, penalised_cost, threshold, threshold_of};
 use crate::search::effort::Effort;
 use crate::search::found::{Found, Rival};
 use crate::search::screen::screen;
@@ -340,7 +338,15 @@ fn larger(
         let least = 0.5 * (other.chi2 - top_chi2);
         let limits = [least, f64::INFINITY];
         let forms = FormError::of(ctx, &other, mask, effort.threads);
-        next.extend(extensions(ctx, (&other, &forms), mask, effort, 4, &[], limits));
+        next.extend(extensions(
+            ctx,
+            (&other, &forms),
+            mask,
+            effort,
+            4,
+            &[],
+            limits,
+        ));
     }
     let cost = |f: &Fit| penalised_cost(ctx, f);
     next.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b)))
@@ -490,7 +496,7 @@ pub(crate) fn settle(
 }
 
 /// Whether two sets have the same forms in the same order.
-fn alike(a: &[Part], b: &[Part]) -> bool {
+pub(crate) fn alike(a: &[Part], b: &[Part]) -> bool {
     a.iter().map(|p| p.variant).eq(b.iter().map(|p| p.variant))
 }
 

@@ -122,20 +122,23 @@ struct Path<'a> {
 
 impl<'a> Path<'a> {
     fn new(t: &'a Trace, h: f64, with_area: bool) -> Self {
-        let n = t.pos.len();
         let mut path = Self {
             t,
             h,
             area: Vec::new(),
         };
-        if with_area {
-            let mut area = Vec::with_capacity(n);
-            let mut sum = 0.0;
-            for j in 0..n {
-                area.push(sum);
-                sum += path.partial_area(j, h);
-            }
-            path.area = area;
+        if with_area && let Some(last) = t.pos.len().checked_sub(1) {
+            // The integral of a cubic by its ends and its slopes there.
+            let slopes = t.start_slope.iter().zip(&t.end_slope);
+            let steps = t.pos.iter().zip(&t.pos[1..]).zip(&t.jump).zip(slopes);
+            let (mut sum, part) = (0.0, h / 12.0);
+            path.area.reserve(last + 1);
+            path.area.extend(steps.map(|(((from, to), jump), (a, b))| {
+                let before = sum;
+                sum += h * (0.5 * (from + jump + to) + part * (a - b));
+                before
+            }));
+            path.area.push(sum);
         }
         path
     }
@@ -153,13 +156,15 @@ impl<'a> Path<'a> {
         [start, a, 3.0 * d - 2.0 * a - b, a + b - 2.0 * d]
     }
 
+    #[inline]
     fn step_of(&self, at: f64) -> (usize, f64) {
         // Limits from the left: a command that acts at the very instant is not seen yet.
         let x = at / self.h;
-        let j = ((x - 1e-7).ceil() - 1.0)
-            .max(0.0)
-            .min(self.t.pos.len() as f64 - 1.0);
-        (j as usize, (x - j).max(0.0))
+        let behind = x - 1e-7;
+        let mut j = behind as usize;
+        j -= usize::from(j > 0 && behind == j as f64);
+        j = j.min(self.t.pos.len() - 1);
+        (j, (x - j as f64).max(0.0))
     }
 
     #[inline]
@@ -176,10 +181,12 @@ impl<'a> Path<'a> {
         c[0] + f * (c[1] + f * (c[2] + f * c[3]))
     }
 
-    fn partial_area(&self, j: usize, upto: f64) -> f64 {
-        let f = upto / self.h;
+    /// Integral over the part `f` of step j.
+    #[inline]
+    fn partial_area(&self, j: usize, f: f64) -> f64 {
+        const THIRD: f64 = 1.0 / 3.0;
         let c = self.cubic(j);
-        self.h * f * (c[0] + f * (c[1] / 2.0 + f * (c[2] / 3.0 + f * c[3] / 4.0)))
+        self.h * f * (c[0] + f * (0.5 * c[1] + f * (THIRD * c[2] + f * (0.25 * c[3]))))
     }
 
     /// Mean between two instants.
@@ -193,7 +200,7 @@ impl<'a> Path<'a> {
             return at * self.t.pos[0];
         }
         let (j, f) = self.step_of(at);
-        self.area[j] + self.partial_area(j, f.min(1.5) * self.h)
+        self.area[j] + self.partial_area(j, f.min(1.5))
     }
 }
 
@@ -229,5 +236,24 @@ mod tests {
             ..Frames::default()
         });
         assert!((averaged - 0.125).abs() < 2e-3, "{averaged}");
+    }
+
+    #[test]
+    fn the_integral_to_each_step_is_that_of_the_steps_before_it() {
+        let of = |f: fn(f64) -> f64| -> Vec<f64> { (0..50).map(|k| f(f64::from(k))).collect() };
+        let t = Trace {
+            pos: of(|k| (0.7 * k).sin()),
+            jump: of(|k| (0.3 * k).cos()),
+            start_slope: of(|k| 40.0 * (1.1 * k).sin()),
+            end_slope: of(|k| 30.0 * (1.3 * k).cos()),
+        };
+        let h = 1e-3;
+        let path = Path::new(&t, h, true);
+        let mut sum = 0.0;
+        for (j, area) in path.area.iter().enumerate() {
+            assert!((area - sum).abs() < 1e-15, "{j}: {area} {sum}");
+            sum += path.partial_area(j, 1.0);
+        }
+        assert_eq!(path.area.len(), 50);
     }
 }

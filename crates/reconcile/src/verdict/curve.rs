@@ -1,10 +1,10 @@
 //! A hysteresis whose memory does not show: a static curve in front of the plant explains as much.
 
-use crate::dot::dot;
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::fit::form_error::curve;
-use crate::fit::linear::Columns;
+use crate::fit::linear::{Columns, normal_equations};
+use crate::mask::Mask;
 use crate::search::cost::{gap, penalised_cost, threshold};
 use crate::search::found::Found;
 use crate::thresholds::THRESHOLDS;
@@ -122,8 +122,9 @@ fn instead_of_curves(ctx: &Context<'_>, set: &Fit) -> Option<f64> {
 
 /// The gain in twice the log-likelihood by further columns in a fit, with its numbers free as well, beyond chance.
 fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>) -> f64 {
-    let mut columns = ctx.tangents(fit, &ctx.problem.all()).columns;
-    let own = gain_of(&columns, &fit.innovations);
+    let all = ctx.problem.all();
+    let mut columns = ctx.tangents(fit, &all).columns;
+    let own = gain_of(&columns, &fit.innovations, &all);
     let at = columns
         .iter()
         .flatten()
@@ -134,30 +135,18 @@ fn gained_beside(ctx: &Context<'_>, fit: &Fit, more: Vec<Vec<Vec<f64>>>) -> f64 
     for (columns, more) in columns.iter_mut().zip(more) {
         columns.extend(more.into_iter().enumerate().map(|(k, c)| (at + k, c)));
     }
-    gain_of(&columns, &fit.innovations) - own - count as f64
+    gain_of(&columns, &fit.innovations, &all) - own - count as f64
 }
 
 /// The gain in twice the log-likelihood when all columns are fitted to innovations, each scaled by its size.
-fn gain_of(columns: &[Columns], e: &[Vec<f64>]) -> f64 {
+fn gain_of(columns: &[Columns], e: &[Vec<f64>], mask: &Mask) -> f64 {
     let n = columns
         .iter()
         .flatten()
         .map(|(k, _)| k + 1)
         .max()
         .unwrap_or(0);
-    let (mut a, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
-    for (columns, e) in columns.iter().zip(e) {
-        for (x, (i, ci)) in columns.iter().enumerate() {
-            g[*i] += dot(ci, e);
-            for (j, cj) in &columns[..=x] {
-                let v = dot(ci, cj);
-                a[(*i, *j)] += v;
-                if i != j {
-                    a[(*j, *i)] += v;
-                }
-            }
-        }
-    }
+    let (a, g) = normal_equations(n, columns, e, mask);
     let size: Vec<f64> = (0..n)
         .map(|i| a[(i, i)].sqrt())
         .map(|s| if s > 0.0 { 1.0 / s } else { 0.0 })

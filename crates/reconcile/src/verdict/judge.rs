@@ -2,7 +2,7 @@
 
 use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
-use crate::fit::form_error::{FormError, SHARE};
+use crate::fit::form_error::FormError;
 use crate::search::cost::{leaves_much, left_over, scatter};
 use crate::search::sequential::ids;
 use crate::thresholds::{CHANCE_SD, THRESHOLDS};
@@ -384,7 +384,7 @@ fn remainder(
         how.push(format!(
             "{:.2} % of the gap is what equations that differ by {:.0} % from those of the names would explain",
             100.0 * of_form,
-            100.0 * SHARE
+            100.0 * THRESHOLDS.form_error
         ));
     }
     how.extend(term.map(|(i, _)| {

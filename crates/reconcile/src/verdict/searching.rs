@@ -10,8 +10,8 @@ use crate::problem::Problem;
 use crate::search::cost::{penalised_cost, threshold_of};
 use crate::search::effort::Effort;
 use crate::search::found::Found;
-use crate::search::sequential::{search, within};
-use crate::thresholds::{NUMBER, THRESHOLDS};
+use crate::search::sequential::{alike, search, within};
+use crate::thresholds::NUMBER;
 use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
 use crate::verdict::late_frames::LateFrames;
@@ -58,7 +58,7 @@ impl Searching<'_> {
             fixed: [self.fixed, &problem.mean].concat(),
             variants: catalogue::variants(self.own_effects),
             free_gain: self.free_gain,
-            white: evidence(self.model, &problem.noise, trusted, problem),
+            white: WhiteEvidence::of(self.model, trusted, problem),
             floor_error: error_of(trusted),
             quantised: problem.quantised,
             scales: self.scales.clone(),
@@ -286,8 +286,7 @@ impl Searching<'_> {
             if moving.found.cut_short {
                 return moving;
             }
-            let mut weighed =
-                self.with_zero_flow(&moving.problem, &moving.found.fit, f64::INFINITY);
+            let mut weighed = self.settled_zero_flow(&moving.problem, &moving.found.fit);
             if let Some(exchanged) = self.weigh_rivals(&mut moving, &weighed) {
                 weighed = exchanged;
             }
@@ -297,6 +296,7 @@ impl Searching<'_> {
             if weighed.cost > self.cost(&moving.problem, &moving.found.fit) - SETTLED {
                 break;
             }
+            let set = weighed.fit.parts.clone();
             moving = self.search(
                 weighed.problem,
                 floor,
@@ -304,6 +304,10 @@ impl Searching<'_> {
                 Some(weighed.fit),
                 &mut *progress,
             );
+            // The zero flow beside this very set was estimated.
+            if alike(&moving.found.fit.parts, &set) {
+                break;
+            }
         }
         progress("looking further without a zero flow that moves");
         let noise = NoiseModel {
@@ -387,6 +391,23 @@ impl Searching<'_> {
             .filter(|best| best.cost < own.cost)
     }
 
+    /// A set with the zero flow that it leaves, each fitted to the other until neither changes.
+    fn settled_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
+        const MOST_ROUNDS: usize = 3;
+        let mut best = self.with_zero_flow(problem, fit, f64::INFINITY);
+        for _ in 1..MOST_ROUNDS {
+            let next = self.with_zero_flow(&best.problem, &best.fit, f64::INFINITY);
+            let gained = best.cost - next.cost;
+            if gained > 0.0 {
+                best = next;
+            }
+            if gained < SETTLED {
+                break;
+            }
+        }
+        best
+    }
+
     /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow. The model's
     /// stated error acts beside the set. What cannot become cheaper than `to_beat` is not followed to the end.
     fn with_zero_flow(&self, problem: &Problem, fit: &Fit, to_beat: f64) -> Weighed {
@@ -460,33 +481,4 @@ struct Weighed {
     problem: Problem,
     fit: Fit,
     cost: f64,
-}
-
-fn evidence(
-    model: &Model,
-    noise: &NoiseModel,
-    trusted: usize,
-    problem: &Problem,
-) -> Option<WhiteEvidence> {
-    let exposure_s = problem
-        .records
-        .first()
-        .map_or(0.0, |r| r.sampling.exposure_s);
-    let model_um2 = model.noise.localisation_um.powi(2);
-    if trusted < 5000 || model_um2 <= 0.0 || noise.coloured.is_some() {
-        return None;
-    }
-    let variance = noise.walk_um2 + 2.0 * noise.white_um2;
-    // Only where the walk is that of the model: else the model's noise says nothing about this rig.
-    let walk = 2.0 * model.noise.diffusion_um2_per_s * problem.base.sample_s;
-    if walk <= 0.0 || (noise.walk_um2 / walk - 1.0).abs() > THRESHOLDS.walk_alike {
-        return None;
-    }
-    Some(WhiteEvidence {
-        estimate_um2: noise.white_um2,
-        error_um2: 1.5 * variance / (trusted as f64).sqrt(),
-        // A known exposure averages a part of the walk off, as [`NoiseModel::from_increments`] says.
-        model_um2: model_um2 - noise.walk_um2 * exposure_s / (6.0 * problem.base.sample_s),
-        walk_um2: noise.walk_um2,
-    })
 }

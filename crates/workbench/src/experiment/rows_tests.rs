@@ -284,7 +284,10 @@ fn a_record_of_an_experiment_begins_when_the_bead_was_caught() {
     let since = all.since_caught();
     assert_eq!(since.pzt_um[..], all.pzt_um[250..]);
     assert_eq!(since.bead_um.len(), 1750);
-    assert_eq!(since.late_motion_um.is_empty(), all.late_motion_um.is_empty());
+    assert_eq!(
+        since.late_motion_um.is_empty(),
+        all.late_motion_um.is_empty()
+    );
 }
 
 #[test]
