@@ -65,28 +65,27 @@ impl FormError {
             .map(|v| v.candidate().params.len())
             .sum();
         let of_part = cellpos_numeric::parallel::map(&parts, threads, |&k| {
-            let size = size_of(ctx, fit, (k, &sim), mask);
-            let columns = freer(ctx, fit, (k, &sim), mask);
-            (size, columns)
+            let each = THRESHOLDS.form_error.powi(2) * size_of(ctx, fit, k, mask);
+            let mut kinds = Vec::new();
+            if fit.parts[k].variant().role == Role::Chain {
+                kinds.push(freer(ctx, fit, (k, &sim), mask));
+            }
+            if fit.parts[k].variant.is_curve() {
+                kinds.push(curve(ctx, fit));
+            }
+            let own = kinds.iter().map(|columns| principal(columns, each, mask));
+            (each, own.collect::<Vec<_>>())
         });
-        for (size, columns) in of_part {
-            let count = columns.iter().map(Vec::len).max().unwrap_or(0);
-            let each = THRESHOLDS.form_error.powi(2) * size / (count + others) as f64;
-            error.whole += each * (count + others) as f64;
-            error.along_others += each;
-            for column in 0..count {
-                let mine: Vec<Vec<f64>> = columns.iter().map(|c| c[column].clone()).collect();
-                let squares = sum_squares(&mine, mask);
-                if squares > 0.0 {
-                    let scale = (each / squares).sqrt();
-                    for (all, mut c) in error.columns.iter_mut().zip(mine) {
-                        c.iter_mut().for_each(|c| *c *= scale);
-                        all.push(c);
-                    }
+        for (each, kinds) in of_part {
+            error.whole += each;
+            error.along_others += each / others as f64;
+            for (whole, own) in kinds {
+                error.whole += whole;
+                for (all, own) in error.columns.iter_mut().zip(own) {
+                    all.extend(own);
                 }
             }
         }
-        error.columns = principal(&error.columns, mask);
         error
     }
 
@@ -119,36 +118,38 @@ impl FormError {
     }
 }
 
-/// Whether the equation of a part may differ from the rig's: a delay and a gain have one equation, and a line, an offset and a user's own
-/// effect are what they are.
+/// Whether the equation of a part may differ from the rig's: a delay, a gain and a constant have one equation, and a user's own effect is
+/// what it is.
 fn has_forms(ctx: &Context<'_>, part: &Part) -> bool {
     let variant = part.variant();
-    let of_one_form =
-        part.variant.is_gain() || matches!(part.effect(&ctx.scope).act(), Action::Delay(_));
-    variant.role == Role::Chain && !variant.off_response && !part.variant.is_own() && !of_one_form
+    let is_constant = variant.role == Role::Chain && variant.off_response;
+    let is_delay = matches!(part.effect(&ctx.scope).act(), Action::Delay(_));
+    !is_constant && !is_delay && !part.variant.is_gain() && !part.variant.is_own()
 }
 
 /// Sum of squares of the innovations that a part makes.
-fn size_of(ctx: &Context<'_>, fit: &Fit, (k, sim): (usize, &[Vec<f64>]), mask: &Mask) -> f64 {
-    let mut parts = fit.parts.clone();
-    parts.remove(k);
-    let without = ctx.simulated(&parts, fit.offset_um, mask);
-    let response: Vec<Vec<f64>> = (ctx.problem.records.iter())
-        .zip(sim.iter().zip(&without))
-        .map(|(r, (with, without))| {
-            let differs = |(a, b): (&f64, &f64)| fit.gain * (a - b);
-            let d: Vec<f64> = with.iter().zip(without).map(differs).collect();
-            match d.is_empty() {
-                true => d,
-                false => r.whitened(&d),
-            }
-        })
-        .collect();
-    sum_squares(&response, mask)
+fn size_of(ctx: &Context<'_>, fit: &Fit, k: usize, mask: &Mask) -> f64 {
+    let mut without = fit.clone();
+    match fit.parts[k].variant().role {
+        Role::Chain => {
+            without.parts.remove(k);
+        }
+        Role::Line { .. } => {
+            let line = &mut without.lines[fit.nth_of_role(k)];
+            (line.iter_mut().flatten()).for_each(|wave| *wave = [0.0; 2]);
+        }
+        Role::Position => without.positions[fit.nth_of_role(k)] = [0.0; 2],
+    }
+    let (mut left, _) = ctx.innovations(&without, mask);
+    for (left, e) in left.iter_mut().zip(&fit.innovations) {
+        left.iter_mut().zip(e).for_each(|(left, e)| *left -= e);
+    }
+    sum_squares(&left, mask)
 }
 
-/// Principal directions of columns by record under a mask, as long as the square roots of their variances.
-fn principal(columns: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
+/// Principal directions of columns by record under a mask, as long as the square roots of their variances; first the sum of these. Of
+/// columns of one size the variance is `each` times the number of independent ones among them.
+fn principal(columns: &[Vec<Vec<f64>>], each: f64, mask: &Mask) -> (f64, Vec<Vec<Vec<f64>>>) {
     let count = columns.iter().map(Vec::len).max().unwrap_or(0);
     let mut products = DMatrix::<f64>::zeros(count, count);
     for (columns, ranges) in columns.iter().zip(mask) {
@@ -161,29 +162,43 @@ fn principal(columns: &[Vec<Vec<f64>>], mask: &Mask) -> Vec<Vec<Vec<f64>>> {
         }
     }
     products.fill_upper_triangle_with_lower_triangle();
+    let scale: Vec<f64> = (products.diagonal().iter())
+        .map(|square| {
+            if *square > 0.0 {
+                square.sqrt().recip()
+            } else {
+                0.0
+            }
+        })
+        .collect();
+    let correlation = DMatrix::from_fn(count, count, |i, j| products[(i, j)] * scale[i] * scale[j]);
+    let squares = correlation.norm_squared();
     // The decomposition of NaN would never end.
-    if count == 0 || products.iter().any(|p| !p.is_finite()) {
-        return vec![Vec::new(); columns.len()];
+    if squares <= 0.0 || !squares.is_finite() {
+        return (0.0, vec![Vec::new(); columns.len()]);
     }
-    let eigen = SymmetricEigen::new(products);
+    let sum = correlation.trace();
+    let variance = each * sum / squares;
+    let eigen = SymmetricEigen::new(correlation);
     let ways: Vec<_> = (eigen.eigenvalues.iter())
         .zip(eigen.eigenvectors.column_iter())
-        .filter(|(variance, _)| **variance > LEAST_VARIANCE)
+        .filter(|(along, _)| **along * variance > LEAST_VARIANCE)
         .map(|(_, way)| way)
         .collect();
     let of_record = |columns: &Vec<Vec<f64>>| -> Vec<Vec<f64>> {
         let rows = columns.first().map_or(0, Vec::len);
         ways.iter()
             .map(|way| {
-                let mut sum = vec![0.0; rows];
-                for (c, part) in columns.iter().zip(way.iter()) {
-                    sum.iter_mut().zip(c).for_each(|(s, c)| *s += part * c);
+                let mut all = vec![0.0; rows];
+                for ((c, part), scale) in columns.iter().zip(way.iter()).zip(&scale) {
+                    let part = part * scale * variance.sqrt();
+                    all.iter_mut().zip(c).for_each(|(s, c)| *s += part * c);
                 }
-                sum
+                all
             })
             .collect()
     };
-    columns.iter().map(of_record).collect()
+    (variance * sum, columns.iter().map(of_record).collect())
 }
 
 /// Innovations by record and column of what freer forms of a part of a fit would change.
@@ -227,11 +242,6 @@ fn freer(
                     false => r.whitened(raw),
                 }));
             }
-        }
-    }
-    if part.variant.is_curve() {
-        for (out, bends) in out.iter_mut().zip(bends(ctx, fit, &KNOTS)) {
-            out.extend(bends);
         }
     }
     out
@@ -338,26 +348,28 @@ mod tests {
     }
 
     #[test]
-    fn principal_directions_have_the_covariance_of_the_columns_without_what_is_below_the_noise() {
+    fn independent_columns_have_the_variance_each_and_those_that_are_alike_share_it() {
         let mask: Mask = vec![
             std::iter::once(0..2).collect(),
             std::iter::once(0..1).collect(),
         ];
-        // The first two columns are nearly one; the third is small.
+        // Two columns that are one but for their size, and one across.
         let columns = vec![
-            vec![vec![3.0, 1.0], vec![3.0, 1.0 + 1e-3], vec![1e-2, -3e-2]],
-            vec![vec![2.0], vec![2.0], vec![1e-2]],
+            vec![vec![3.0, 1.0], vec![6.0, 2.0], vec![1.0, -3.0]],
+            vec![vec![2.0], vec![4.0], vec![0.0]],
         ];
-        let kept = principal(&columns, &mask);
-        assert_eq!(kept[0].len(), 1);
-        let all = |c: &[Vec<Vec<f64>>], k: usize| [c[0][k][0], c[0][k][1], c[1][k][0]];
-        for i in 0..3 {
-            for j in 0..3 {
-                let of = |c: &[Vec<Vec<f64>>]| -> f64 {
-                    (0..c[0].len()).map(|k| all(c, k)[i] * all(c, k)[j]).sum()
-                };
-                assert!((of(&kept) - of(&columns)).abs() < 5e-3, "{i} {j}");
-            }
-        }
+        let (whole, kept) = principal(&columns, 9.0, &mask);
+        let sizes: Vec<f64> = (0..2)
+            .map(|k| {
+                let mine = [kept[0][k].clone(), kept[1][k].clone()];
+                sum_squares(&mine, &mask)
+            })
+            .collect();
+        // Of three columns 9/5 are independent: squares of the eigenvalues 2 and 1 over the square of their sum.
+        assert!((whole - 9.0 * 9.0 / 5.0).abs() < 1e-9, "{whole}");
+        assert!((sizes[0] + sizes[1] - whole).abs() < 1e-9, "{sizes:?}");
+        assert!((sizes[0].max(sizes[1]) - 2.0 * 9.0 * 3.0 / 5.0).abs() < 1e-9);
+        // What is below the noise is left out.
+        assert!(principal(&columns, 0.1, &mask).1[0].len() == 1);
     }
 }

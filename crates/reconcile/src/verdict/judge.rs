@@ -71,10 +71,11 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     // What the equations of the set leave if the rig has others.
     let of_form = FormError::of(ctx, e.fit, &all, threads).takes_off(ctx, e.fit, &all);
     let of_form = if excess > 0.0 { of_form / excess } else { 0.0 };
+    eprintln!("DBG of_form {of_form} closed {closed} term {term:?} ids {:?} curved {:?}", ids(e.fit), e.aside.curved);
     let much = leaves_much(e.null, e.fit);
     let beyond_chance = much || term.is_some();
-    let mut curved = e.aside.curved.iter();
-    let remains = beyond_chance || curved.any(|(_, share)| *share > THRESHOLDS.term_share);
+    let mut by_another_form = (e.aside.curved.iter().map(|(_, share)| *share)).chain([of_form]);
+    let remains = beyond_chance || by_another_form.any(|share| share > THRESHOLDS.term_share);
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
         reasons: Vec::new(),
