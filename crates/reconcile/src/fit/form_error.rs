@@ -20,6 +20,9 @@ use crate::thresholds::THRESHOLDS;
 use cellpos_plant::effects::{Action, Role};
 use nalgebra::{DMatrix, SymmetricEigen};
 
+/// Sizes that an error of form may have, in those of [`crate::thresholds::Thresholds::form_error`]: some equations are nearly nature's, and some
+/// describe a knee that is as wide as the range. Each is as likely.
+const SIZES: [f64; 3] = [1.0 / 3.0, 1.0, 3.0];
 /// Time constants of the slower parts, in rows: up to a decade beyond the memory of the effect.
 const SMOOTH_ROWS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 /// How far numbers are spread, in parts of themselves.
@@ -27,7 +30,7 @@ const SPREAD: [f64; 2] = [0.04, 0.12];
 /// Places in the command's range, as shares of it, at which a curve may bend.
 const KNOTS: [f64; 7] = [0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875];
 /// Directions along which the variance is less than this part of the noise's take nothing off that matters.
-const LEAST_VARIANCE: f64 = 0.1;
+const LEAST_VARIANCE: f64 = 0.02;
 
 /// The error of form of a set, in the space of innovations.
 pub(crate) struct FormError {
@@ -35,8 +38,6 @@ pub(crate) struct FormError {
     columns: Vec<Vec<Vec<f64>>>,
     /// Variance along the response of any other effect, in that of the noise.
     along_others: f64,
-    /// Variance along all directions together.
-    whole: f64,
 }
 
 impl FormError {
@@ -45,7 +46,6 @@ impl FormError {
         Self {
             columns: vec![Vec::new(); ctx.problem.records.len()],
             along_others: 0.0,
-            whole: 0.0,
         }
     }
 
@@ -77,21 +77,14 @@ impl FormError {
             (each, own.collect::<Vec<_>>())
         });
         for (each, kinds) in of_part {
-            error.whole += each;
             error.along_others += each / others as f64;
-            for (whole, own) in kinds {
-                error.whole += whole;
+            for own in kinds {
                 for (all, own) in error.columns.iter_mut().zip(own) {
                     all.extend(own);
                 }
             }
         }
         error
-    }
-
-    /// Twice the log-likelihood that a gain of the sum of squares is worth at least, whatever the directions of the gain.
-    pub(crate) fn least_of(&self, gained: f64) -> f64 {
-        gained / (1.0 + self.whole)
     }
 
     /// What a gain is worth that was computed beside the columns, for a response that is one of those it may be taken for.
@@ -107,15 +100,45 @@ impl FormError {
         }
     }
 
-    /// What it takes off the sum of squares of a fit, the numbers of the fit refitted, to the first order.
-    pub(crate) fn takes_off(&self, ctx: &Context<'_>, fit: &Fit, mask: &Mask) -> f64 {
+    /// Its most probable size in the residual of a fit whose numbers are fitted again, to the first order.
+    pub(crate) fn most_probable(&self, ctx: &Context<'_>, fit: &Fit, mask: &Mask) -> MostProbable {
+        let mut best = MostProbable::default();
         if self.columns.iter().all(Vec::is_empty) {
-            return 0.0;
+            return best;
         }
-        let tangents = ctx.tangents(fit, mask);
-        let without = tangents.gain_of_all();
-        (self.beside(tangents, fit, mask).gain_of_all() - without).max(0.0)
+        let along = ctx
+            .tangents(fit, mask)
+            .across(&self.columns, &fit.innovations, mask);
+        for size in SIZES {
+            let variances = along
+                .iter()
+                .map(|(square, score)| (size * size * square, score));
+            let (mut takes_off, mut worth) = (0.0, 0.0);
+            for (variance, score) in variances {
+                let off = size * size * score / (1.0 + variance);
+                takes_off += off;
+                worth += off - variance.ln_1p();
+            }
+            if worth > best.worth {
+                best = MostProbable { takes_off, worth };
+            }
+        }
+        best
     }
+}
+
+/// Part of the gap that the largest error of form explains.
+pub(crate) fn largest_share() -> f64 {
+    (SIZES[SIZES.len() - 1] * THRESHOLDS.form_error).powi(2)
+}
+
+/// The error of form of the most probable size; nothing if none at all is more probable.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct MostProbable {
+    /// What it takes off the sum of squares.
+    pub takes_off: f64,
+    /// What it adds to twice the log-likelihood.
+    pub worth: f64,
 }
 
 /// Whether the equation of a part may differ from the rig's: a delay, a gain and a constant have one equation, and a user's own effect is
@@ -147,9 +170,9 @@ fn size_of(ctx: &Context<'_>, fit: &Fit, k: usize, mask: &Mask) -> f64 {
     sum_squares(&left, mask)
 }
 
-/// Principal directions of columns by record under a mask, as long as the square roots of their variances; first the sum of these. Of
-/// columns of one size the variance is `each` times the number of independent ones among them.
-fn principal(columns: &[Vec<Vec<f64>>], each: f64, mask: &Mask) -> (f64, Vec<Vec<Vec<f64>>>) {
+/// Principal directions of columns by record under a mask, as long as the square roots of their variances. Of columns of one size the
+/// variance is `each` times the number of independent ones among them.
+fn principal(columns: &[Vec<Vec<f64>>], each: f64, mask: &Mask) -> Vec<Vec<Vec<f64>>> {
     let count = columns.iter().map(Vec::len).max().unwrap_or(0);
     let mut products = DMatrix::<f64>::zeros(count, count);
     for (columns, ranges) in columns.iter().zip(mask) {
@@ -175,10 +198,9 @@ fn principal(columns: &[Vec<Vec<f64>>], each: f64, mask: &Mask) -> (f64, Vec<Vec
     let squares = correlation.norm_squared();
     // The decomposition of NaN would never end.
     if squares <= 0.0 || !squares.is_finite() {
-        return (0.0, vec![Vec::new(); columns.len()]);
+        return vec![Vec::new(); columns.len()];
     }
-    let sum = correlation.trace();
-    let variance = each * sum / squares;
+    let variance = each * correlation.trace() / squares;
     let eigen = SymmetricEigen::new(correlation);
     let ways: Vec<_> = (eigen.eigenvalues.iter())
         .zip(eigen.eigenvectors.column_iter())
@@ -198,7 +220,7 @@ fn principal(columns: &[Vec<Vec<f64>>], each: f64, mask: &Mask) -> (f64, Vec<Vec
             })
             .collect()
     };
-    (variance * sum, columns.iter().map(of_record).collect())
+    columns.iter().map(of_record).collect()
 }
 
 /// Innovations by record and column of what freer forms of a part of a fit would change.
@@ -358,7 +380,7 @@ mod tests {
             vec![vec![3.0, 1.0], vec![6.0, 2.0], vec![1.0, -3.0]],
             vec![vec![2.0], vec![4.0], vec![0.0]],
         ];
-        let (whole, kept) = principal(&columns, 9.0, &mask);
+        let kept = principal(&columns, 9.0, &mask);
         let sizes: Vec<f64> = (0..2)
             .map(|k| {
                 let mine = [kept[0][k].clone(), kept[1][k].clone()];
@@ -366,10 +388,12 @@ mod tests {
             })
             .collect();
         // Of three columns 9/5 are independent: squares of the eigenvalues 2 and 1 over the square of their sum.
-        assert!((whole - 9.0 * 9.0 / 5.0).abs() < 1e-9, "{whole}");
-        assert!((sizes[0] + sizes[1] - whole).abs() < 1e-9, "{sizes:?}");
+        assert!(
+            (sizes[0] + sizes[1] - 9.0 * 9.0 / 5.0).abs() < 1e-9,
+            "{sizes:?}"
+        );
         assert!((sizes[0].max(sizes[1]) - 2.0 * 9.0 * 3.0 / 5.0).abs() < 1e-9);
         // What is below the noise is left out.
-        assert!(principal(&columns, 0.1, &mask).1[0].len() == 1);
+        assert!(principal(&columns, 0.02, &mask)[0].len() == 1);
     }
 }

@@ -2,12 +2,13 @@
 
 use crate::dot::dot;
 use crate::mask::Mask;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 /// Columns of one record: (index of the parameter, whitened derivative).
 pub(crate) type Columns = Vec<(usize, Vec<f64>)>;
 
 /// Whitened tangents of a fit: what further candidates are projected against.
+#[derive(Debug, Clone)]
 pub(crate) struct Tangents {
     /// Per record: (index of the parameter, whitened column).
     pub columns: Vec<Columns>,
@@ -88,9 +89,33 @@ impl Tangents {
         self
     }
 
-    /// Fall of the sum of squares by the best step along all columns, to the first order.
-    pub(crate) fn gain_of_all(&self) -> f64 {
-        self.gradient.dot(&(&self.inverse * &self.gradient))
+    /// What further columns by record hold that these do not: for each principal direction its sum of squares, and the square of its product
+    /// with the innovations.
+    pub(crate) fn across(
+        &self,
+        further: &[Vec<Vec<f64>>],
+        e: &[Vec<f64>],
+        mask: &Mask,
+    ) -> Vec<(f64, f64)> {
+        let free = self.gradient.len();
+        let count = further.iter().map(Vec::len).max().unwrap_or(0);
+        let mut columns = self.columns.clone();
+        for (columns, further) in columns.iter_mut().zip(further) {
+            columns.extend((free..).zip(further.iter().cloned()));
+        }
+        let (normal, gradient) = normal_equations(free + count, &columns, e, mask);
+        let shared = normal.view((free, 0), (count, free));
+        let taken = shared * &self.inverse;
+        let own = normal.view((free, free), (count, count)) - &taken * shared.transpose();
+        let products = gradient.rows(free, count) - &taken * &self.gradient;
+        // The decomposition of NaN would never end.
+        if own.iter().chain(products.iter()).any(|x| !x.is_finite()) {
+            return Vec::new();
+        }
+        let eigen = SymmetricEigen::new(own);
+        let along = eigen.eigenvectors.transpose() * products;
+        let squares = eigen.eigenvalues.iter().map(|square| square.max(0.0));
+        squares.zip(along.iter().map(|x| x * x)).collect()
     }
 }
 
@@ -198,15 +223,20 @@ mod tests {
             gradient: DVector::zeros(0),
         };
         let innovations = [e.to_vec()];
-        let beside = none.with_priors(&[errors.to_vec()], &innovations, &mask);
+        let beside = none
+            .clone()
+            .with_priors(&[errors.to_vec()], &innovations, &mask);
         let covariance = DMatrix::from_fn(3, 3, |i, j| {
             f64::from(u8::from(i == j)) + errors.iter().map(|d| d[i] * d[j]).sum::<f64>()
         });
         let weight = covariance.try_inverse().expect("a covariance");
         let [e_, v_] = [e, v].map(|x| DVector::from_row_slice(&x));
         let of = |a: &DVector<f64>, b: &DVector<f64>| a.dot(&(&weight * b));
-        let taken_off = e_.dot(&e_) - of(&e_, &e_);
-        assert!((beside.gain_of_all() - taken_off).abs() < 1e-12);
+        // All that a further column takes off, by its principal directions.
+        let taken_off: f64 = (none.across(&[errors.to_vec()], &innovations, &mask).iter())
+            .map(|(square, score)| score / (1.0 + square))
+            .sum();
+        assert!((taken_off - (e_.dot(&e_) - of(&e_, &e_))).abs() < 1e-12);
         let gain = beside.gain(&[v.to_vec()], &innovations, &mask);
         assert!((gain.score - of(&v_, &e_).powi(2) / of(&v_, &v_)).abs() < 1e-12);
         assert!((gain.own - of(&v_, &v_)).abs() < 1e-12);

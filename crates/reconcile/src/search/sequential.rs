@@ -133,11 +133,8 @@ fn worth_it(
     if gained <= least {
         return false;
     }
-    if forms.least_of(gained) > least {
-        return true;
-    }
-    let takes_off = |fit: &Fit| forms.takes_off(ctx, fit, mask);
-    let beside = gained - takes_off(smaller) + takes_off(bigger);
+    let worth = |fit: &Fit| forms.most_probable(ctx, fit, mask).worth;
+    let beside = gained - worth(smaller) + worth(bigger);
     let new = |p: &&Part| !smaller.has(p.id());
     let off_response = (bigger.parts.iter().filter(new)).all(|p| p.variant().off_response);
     let worth = match off_response {
@@ -313,14 +310,22 @@ fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
     count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
 
-/// The best single effect and its two rivals; `None` if nothing is worth a name.
+/// The best single effect, its error of form in the balance, and its two rivals; `None` if nothing is worth a name.
 fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
     let none = FormError::none(ctx);
     let mut singles = extensions(ctx, (null, &none), mask, effort, 8, &[], FREELY);
     singles.retain(|f| worth_it((ctx, mask), (null, &none), f));
-    let mut singles = singles.into_iter();
-    let best = singles.next()?;
-    Some((best, singles.take(2).collect()))
+    singles.truncate(3);
+    let mut singles: Vec<(f64, Fit)> = (singles.into_iter())
+        .map(|fit| {
+            let forms = FormError::of(ctx, &fit, mask, effort.threads);
+            let worth = forms.most_probable(ctx, &fit, mask).worth;
+            (penalised_cost(ctx, &fit) - worth, fit)
+        })
+        .collect();
+    singles.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut singles = singles.into_iter().map(|(_, fit)| fit);
+    Some((singles.next()?, singles.collect()))
 }
 
 /// The best set with one more effect than a set; `None` if none is worth it.

@@ -2,7 +2,7 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::fit::form_error::curve;
+use crate::fit::form_error::{curve, largest_share};
 use crate::fit::linear::{Columns, normal_equations};
 use crate::mask::Mask;
 use crate::search::cost::{gap, penalised_cost, threshold};
@@ -40,7 +40,9 @@ pub(crate) fn set_aside(ctx: &Context<'_>, found: &mut Found) -> Aside {
             i += 1;
             continue;
         }
-        if let Some(fit) = in_its_stead(ctx, found, i, &without) {
+        // What is smaller than an error of form may be is a form of the others.
+        let is_large = gained > largest_share() * gap;
+        if is_large && let Some(fit) = in_its_stead(ctx, found, i, &without) {
             found.fit = fit;
             let taken = found.fit.parts[i].id();
             found.rivals[i].retain(|r| r.id != taken);

@@ -69,9 +69,14 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
     // What the equations of the set leave if the rig has others.
-    let of_form = FormError::of(ctx, e.fit, &all, threads).takes_off(ctx, e.fit, &all);
+    let of_form = FormError::of(ctx, e.fit, &all, threads)
+        .most_probable(ctx, e.fit, &all)
+        .takes_off;
     let of_form = if excess > 0.0 { of_form / excess } else { 0.0 };
-    eprintln!("DBG of_form {of_form} closed {closed} term {term:?} ids {:?} curved {:?}", ids(e.fit), e.aside.curved);
+    eprintln!(
+        ids(e.fit),
+        e.aside.curved
+    );
     let much = leaves_much(e.null, e.fit);
     let beyond_chance = much || term.is_some();
     let mut by_another_form = (e.aside.curved.iter().map(|(_, share)| *share)).chain([of_form]);
@@ -383,9 +388,8 @@ fn remainder(
         .collect();
     if of_form > 0.5 * share {
         how.push(format!(
-            "{:.2} % of the gap is what equations that differ by {:.0} % from those of the names would explain",
-            100.0 * of_form,
-            100.0 * THRESHOLDS.form_error
+            "{:.2} % of the gap is what equations that differ from those of the names would explain",
+            100.0 * of_form
         ));
     }
     how.extend(term.map(|(i, _)| {
