@@ -73,10 +73,6 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         .most_probable(ctx, e.fit, &all)
         .takes_off;
     let of_form = if excess > 0.0 { of_form / excess } else { 0.0 };
-    eprintln!(
-        ids(e.fit),
-        e.aside.curved
-    );
     let much = leaves_much(e.null, e.fit);
     let beyond_chance = much || term.is_some();
     let mut by_another_form = (e.aside.curved.iter().map(|(_, share)| *share)).chain([of_form]);
