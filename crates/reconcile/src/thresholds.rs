@@ -19,11 +19,9 @@ pub struct Thresholds {
     /// Factor, for the error of the noise estimate, on the least gain of an addition in twice the log-likelihood. That gain is the
     /// quantile of chi-square with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
-    /// Part of an effect's response by which its equation may differ from the rig's, as a standard deviation. What such a difference can look
-    /// like is no evidence for another effect. The second equations of the tests' simulator differ by so much (`reconcile-table seconds`).
-    /// Pinned by `a_small_effect_that_another_form_of_the_large_one_explains_is_no_name` and
-    /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
-    pub form_error: f64,
+    /// Least gain of a further response to the command, as a share of the gain explained already. The equations of the first
+    /// effect are not exactly nature's. Pinned by the tests' simulator (relays for play operators).
+    pub addition_share: f64,
     /// Rivals closer than this in twice the log-likelihood count as equal to the winner: e^5 to 1. Pinned by
     /// `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
     pub tie: f64,
@@ -45,6 +43,22 @@ pub struct Thresholds {
     pub split_share: f64,
     /// An effect smaller than the smallest that matters is not named unless it explains this part of the excess.
     pub small_share: f64,
+    /// A small effect that explains less than this share of the gap may be the difference between the catalogue's equation of a
+    /// larger effect and the rig's. It gets no name if freer forms of the larger ones gain as much. Beyond this share, and for two
+    /// effects of like size, nobody could say which is the other's form. Pinned by
+    /// `a_small_effect_that_another_form_of_the_large_one_explains_is_no_name`.
+    pub companion_share: f64,
+    /// An effect is larger if it explains this many times as much. Pinned with it.
+    pub companion_times: f64,
+    /// Next to a real companion, freer forms of the large effects gain less than this share of the companion's gain. In the tests'
+    /// simulator they gained at most 0.05 if the companion was hidden, and at least 0.16 if it was not. Pinned with it.
+    pub companion_rest: f64,
+    /// If the main number of a companion is outside the range of known rigs, this share is enough: a creep by a power law leaves a
+    /// residual like a relaxation of a millisecond.
+    pub companion_untypical: f64,
+    /// An addition smaller than [`Self::addition_share`] must gain this many times the usual least gain. Pinned by
+    /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
+    pub small_gain: f64,
     /// A hysteresis gets no name if a curve without memory in front of the plant explains this share of what it explains beyond a gain. For
     /// relays that share is 0.4 to 0.8. Pinned by `a_hysteresis_that_any_curve_explains_is_no_name`.
     pub curve_share: f64,
@@ -114,7 +128,7 @@ pub struct Thresholds {
 /// The numbers in use.
 pub const THRESHOLDS: Thresholds = Thresholds {
     addition_noise: 1.3,
-    form_error: 0.1,
+    addition_share: 0.0015,
     tie: 10.0,
     closed_least: 0.80,
     closed_whole: 0.985,
@@ -123,6 +137,11 @@ pub const THRESHOLDS: Thresholds = Thresholds {
     held_out_least: 0.5,
     split_share: 0.15,
     small_share: 0.5,
+    companion_share: 0.1,
+    companion_times: 3.0,
+    companion_rest: 0.1,
+    companion_untypical: 0.5,
+    small_gain: 4.0,
     curve_share: 0.95,
     floor_rows: 400,
     rest_share: 1e-3,

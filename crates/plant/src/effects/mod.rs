@@ -179,6 +179,11 @@ pub trait EffectKind: fmt::Debug + Send + Sync + AsEffectKind {
         false
     }
 
+    /// Whether it gives slow and fast motion different gains. Its form (anchoring) then says which of the two is the model's gain.
+    fn has_two_gains(&self) -> bool {
+        false
+    }
+
     /// Whether it multiplies all motion by one factor and does nothing else.
     fn is_gain(&self) -> bool {
         false

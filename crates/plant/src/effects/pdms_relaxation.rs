@@ -66,6 +66,10 @@ impl EffectKind for PdmsRelaxation {
         Action::Linear(wall)
     }
 
+    fn has_two_gains(&self) -> bool {
+        true
+    }
+
     fn candidates(&self) -> &'static [Candidate] {
         const ALL: &[Candidate] = &FREE.anchored();
         ALL

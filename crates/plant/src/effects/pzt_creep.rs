@@ -76,6 +76,10 @@ impl EffectKind for PztCreep {
         Action::Linear(creep(effect.scalar(0), since))
     }
 
+    fn has_two_gains(&self) -> bool {
+        true
+    }
+
     fn shapes(&self, form: usize) -> &'static [usize] {
         match form {
             WITH_ONSET => &[WITH_SHARP_ONSET],

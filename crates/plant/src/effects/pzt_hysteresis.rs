@@ -251,6 +251,10 @@ impl EffectKind for PztHysteresis {
         Ok(())
     }
 
+    fn has_two_gains(&self) -> bool {
+        true
+    }
+
     fn memoryless(&self) -> Option<usize> {
         CANDIDATES.iter().position(|c| c.name == "curvature")
     }

@@ -26,6 +26,11 @@ impl Variant {
         self.kind.definition().is_some()
     }
 
+    /// Whether slow motion gets another gain by it than fast motion.
+    pub(crate) fn has_two_gains(self) -> bool {
+        self.kind.has_two_gains()
+    }
+
     /// Whether it is a curve of its input alone.
     pub(crate) fn is_curve(self) -> bool {
         self.kind.is_curve()

@@ -2,13 +2,12 @@
 
 use crate::dot::dot;
 use crate::mask::Mask;
-use nalgebra::{DMatrix, DVector, SymmetricEigen};
+use nalgebra::{DMatrix, DVector};
 
 /// Columns of one record: (index of the parameter, whitened derivative).
 pub(crate) type Columns = Vec<(usize, Vec<f64>)>;
 
 /// Whitened tangents of a fit: what further candidates are projected against.
-#[derive(Debug, Clone)]
 pub(crate) struct Tangents {
     /// Per record: (index of the parameter, whitened column).
     pub columns: Vec<Columns>,
@@ -58,64 +57,6 @@ impl Tangents {
             scale: -de2 / dd2,
             own: dd2,
         }
-    }
-}
-
-impl Tangents {
-    /// These with further columns by record, each with a prior of standard deviation 1.
-    pub(crate) fn with_priors(
-        mut self,
-        further: &[Vec<Vec<f64>>],
-        e: &[Vec<f64>],
-        mask: &Mask,
-    ) -> Self {
-        let free = self.gradient.len();
-        let count = free + further.iter().map(Vec::len).max().unwrap_or(0);
-        for (columns, further) in self.columns.iter_mut().zip(further) {
-            columns.extend((free..).zip(further.iter().cloned()));
-        }
-        let (mut normal, gradient) = normal_equations(count, &self.columns, e, mask);
-        for i in 0..count {
-            let own = normal[(i, i)];
-            normal[(i, i)] += match i < free {
-                true if own == 0.0 => 1.0,
-                true => 1e-9 * own,
-                false => 1.0,
-            };
-        }
-        let inverse = normal.try_inverse();
-        self.inverse = inverse.unwrap_or_else(|| DMatrix::identity(count, count));
-        self.gradient = gradient;
-        self
-    }
-
-    /// What further columns by record hold that these do not: for each principal direction its sum of squares, and the square of its product
-    /// with the innovations.
-    pub(crate) fn across(
-        &self,
-        further: &[Vec<Vec<f64>>],
-        e: &[Vec<f64>],
-        mask: &Mask,
-    ) -> Vec<(f64, f64)> {
-        let free = self.gradient.len();
-        let count = further.iter().map(Vec::len).max().unwrap_or(0);
-        let mut columns = self.columns.clone();
-        for (columns, further) in columns.iter_mut().zip(further) {
-            columns.extend((free..).zip(further.iter().cloned()));
-        }
-        let (normal, gradient) = normal_equations(free + count, &columns, e, mask);
-        let shared = normal.view((free, 0), (count, free));
-        let taken = shared * &self.inverse;
-        let own = normal.view((free, free), (count, count)) - &taken * shared.transpose();
-        let products = gradient.rows(free, count) - &taken * &self.gradient;
-        // The decomposition of NaN would never end.
-        if own.iter().chain(products.iter()).any(|x| !x.is_finite()) {
-            return Vec::new();
-        }
-        let eigen = SymmetricEigen::new(own);
-        let along = eigen.eigenvectors.transpose() * products;
-        let squares = eigen.eigenvalues.iter().map(|square| square.max(0.0));
-        squares.zip(along.iter().map(|x| x * x)).collect()
     }
 }
 
@@ -210,35 +151,5 @@ mod tests {
         // Across the step, in the metric, nothing was learnt: 4 * 0.5 * x + 100 * -0.25 * y = 0 for (x, y) = (12.5, 1).
         assert!((at(&columns, 0, [12.5, 1.0]) - 12.5).abs() < 1e-12);
         assert!((at(&columns, 1, [12.5, 1.0]) - 3.0).abs() < 1e-12);
-    }
-
-    #[test]
-    fn a_direction_gains_what_it_does_with_the_priors_in_the_covariance() {
-        let mask: Mask = vec![std::iter::once(0..3).collect()];
-        let (e, v) = ([1.0, -2.0, 0.5], [0.3, 1.0, 2.0]);
-        let errors = [vec![2.0, 1.0, 0.0], vec![0.0, 0.5, -1.0]];
-        let none = Tangents {
-            columns: vec![Vec::new()],
-            inverse: DMatrix::zeros(0, 0),
-            gradient: DVector::zeros(0),
-        };
-        let innovations = [e.to_vec()];
-        let beside = none
-            .clone()
-            .with_priors(&[errors.to_vec()], &innovations, &mask);
-        let covariance = DMatrix::from_fn(3, 3, |i, j| {
-            f64::from(u8::from(i == j)) + errors.iter().map(|d| d[i] * d[j]).sum::<f64>()
-        });
-        let weight = covariance.try_inverse().expect("a covariance");
-        let [e_, v_] = [e, v].map(|x| DVector::from_row_slice(&x));
-        let of = |a: &DVector<f64>, b: &DVector<f64>| a.dot(&(&weight * b));
-        // All that a further column takes off, by its principal directions.
-        let taken_off: f64 = (none.across(&[errors.to_vec()], &innovations, &mask).iter())
-            .map(|(square, score)| score / (1.0 + square))
-            .sum();
-        assert!((taken_off - (e_.dot(&e_) - of(&e_, &e_))).abs() < 1e-12);
-        let gain = beside.gain(&[v.to_vec()], &innovations, &mask);
-        assert!((gain.score - of(&v_, &e_).powi(2) / of(&v_, &v_)).abs() < 1e-12);
-        assert!((gain.own - of(&v_, &v_)).abs() < 1e-12);
     }
 }

@@ -6,7 +6,6 @@ pub(crate) mod catalogue;
 pub(crate) mod context;
 pub(crate) mod descent;
 mod evaluate;
-pub(crate) mod form_error;
 pub(crate) mod linear;
 pub(crate) mod locking;
 mod position_error;

@@ -2,8 +2,9 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
+use crate::mask::Mask;
 use crate::thresholds::{CHANCE, CHANCE_SD, NUMBER, THRESHOLDS};
-use cellpos_plant::effects::Candidate;
+use cellpos_plant::effects::{Action, Candidate};
 
 /// Upper quantile of chi-square with `k` degrees of freedom at `z` standard normal deviations (Wilson-Hilferty).
 fn chi2_quantile(k: f64, z: f64) -> f64 {
@@ -15,6 +16,12 @@ fn chi2_quantile(k: f64, z: f64) -> f64 {
 /// the noise estimate.
 pub(crate) fn threshold(freedom: usize) -> f64 {
     THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, CHANCE_SD)
+}
+
+/// Least gain of a further response to the command over a set that explains `gained`: beyond chance, and beyond the difference between
+/// the equations and nature's.
+pub(crate) fn least_gain(freedom: usize, gained: f64) -> f64 {
+    threshold(freedom).max(THRESHOLDS.addition_share * gained)
 }
 
 /// Least gain of the best of this number of waves, each with its sine and cosine: the tail of chi-square with two degrees is
@@ -58,6 +65,21 @@ pub(crate) fn gap(null: &Fit) -> f64 {
 pub(crate) fn surely_left(ctx: &Context<'_>, fit: &Fit) -> f64 {
     let noise = fit.count as f64 * (1.0 + ctx.floor_error).powi(2);
     (fit.chi2 - noise).max(0.0)
+}
+
+/// Sum of squares before the effects of a set that have a choice of equation. The set's delay and gain are already in it: each has
+/// one equation, so it leaves no error of form that could be taken for another name.
+pub(crate) fn before_forms(ctx: &Context<'_>, null: &Fit, fit: &Fit, mask: &Mask) -> f64 {
+    let of_one_form =
+        |p: &&Part| p.variant.is_gain() || matches!(p.effect(&ctx.scope).act(), Action::Delay(_));
+    let exact: Vec<Part> = fit.parts.iter().filter(of_one_form).cloned().collect();
+    let before = null.chi2 + null.absorbed;
+    let alone = match exact.len() {
+        0 => return before,
+        n if n == fit.parts.len() => fit.chi2,
+        _ => ctx.fit_from(exact, Some(fit.soft), mask, 8).chi2,
+    };
+    alone.min(before)
 }
 
 /// Scatter of a sum of squares over `n` rows: chance, and the error of the noise estimate.

@@ -3,9 +3,10 @@
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
-use crate::fit::form_error::FormError;
 use crate::mask::Mask;
-use crate::search::cost::{gap, leaves_much, left_over, penalised_cost, threshold, threshold_of};
+use crate::search::cost::{
+    before_forms, gap, least_gain, leaves_much, left_over, penalised_cost, threshold_of,
+};
 use crate::search::effort::Effort;
 use crate::search::found::{Found, Rival};
 use crate::search::screen::screen;
@@ -19,18 +20,18 @@ pub(crate) fn within(fit: &Fit) -> f64 {
 /// Whatever is beyond chance, followed to the end.
 pub(crate) const FREELY: [f64; 2] = [0.0, f64::INFINITY];
 
-/// Fits the best leads next to a set and returns the fits, best first. `forms` is the error of form of the set beside which they must
-/// gain something, `least` the least gain that a lead must promise. A fit with a sum of squares above `rival_of` is not continued.
-fn extensions(
+/// Fits the best leads next to a set and returns the fits, best first. `least` is the least gain that a lead must promise. A fit
+/// with a sum of squares above `rival_of` is not continued.
+pub(crate) fn extensions(
     ctx: &Context<'_>,
-    (fit, forms): (&Fit, &FormError),
+    fit: &Fit,
     mask: &Mask,
     effort: Effort,
     wide: usize,
     forbidden: &[&str],
     [least, rival_of]: [f64; 2],
 ) -> Vec<Fit> {
-    let tangents = forms.beside(ctx.tangents(fit, mask), fit, mask);
+    let tangents = ctx.tangents(fit, mask);
     let leads = screen(ctx, fit, &tangents, mask, effort.threads, |v| {
         !v.candidate().late
             && !v.is_own()
@@ -42,11 +43,12 @@ fn extensions(
     let worth: Vec<Part> = leads
         .into_iter()
         .filter(|l| {
-            let score = match l.part.variant().off_response {
-                true => l.score,
-                false => forms.beside_others(l.score),
+            let least = if l.part.variant().off_response {
+                0.0
+            } else {
+                least
             };
-            score > 0.5 * threshold_of(l.part.variant(), records).max(least)
+            l.score > 0.5 * threshold_of(l.part.variant(), records).max(least)
         })
         .map(|l| l.part)
         .collect();
@@ -121,42 +123,40 @@ fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&
     cellpos_numeric::parallel::map(&best, effort.threads, |f| ctx.refit(f, mask, LONG))
 }
 
-/// Whether the part of `bigger` that `smaller` lacks is worth having beside the error of form of `smaller`.
-fn worth_it(
-    (ctx, mask): (&Context<'_>, &Mask),
-    (smaller, forms): (&Fit, &FormError),
-    bigger: &Fit,
-) -> bool {
+/// Whether the part of `bigger` that `smaller` lacks is worth having; `null` is the sum of squares before the forms of `smaller`.
+fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
     let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
-    let least = threshold(added);
-    let gained = smaller.chi2 - bigger.chi2;
-    if gained <= least {
-        return false;
-    }
-    let worth = |fit: &Fit| forms.most_probable(ctx, fit, mask).worth;
-    let beside = gained - worth(smaller) + worth(bigger);
-    let new = |p: &&Part| !smaller.has(p.id());
-    let off_response = (bigger.parts.iter().filter(new)).all(|p| p.variant().off_response);
-    let worth = match off_response {
-        true => beside,
-        false => forms.beside_others(beside),
+    let off_response = bigger
+        .parts
+        .iter()
+        .filter(|p| !smaller.has(p.id()))
+        .all(|p| p.variant().off_response);
+    let gained = if off_response {
+        0.0
+    } else {
+        null - smaller.chi2
     };
-    worth > least
+    smaller.chi2 - bigger.chi2 > least_gain(added, gained)
 }
 
 /// Takes back effects that are no longer needed.
-fn eliminate(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> Fit {
+fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: &Fit, mask: &Mask, effort: Effort) -> Fit {
+    let null = before_forms(ctx, null, &fit, mask);
     while fit.parts.len() > 1 {
         let indices: Vec<usize> = (0..fit.parts.len()).collect();
         let without = cellpos_numeric::parallel::map(&indices, effort.threads, |&i| {
-            let without = ctx.fit_without(&fit, i, mask, 8);
-            let forms = FormError::of(ctx, &without, mask, 1);
-            let needed = worth_it((ctx, mask), (&without, &forms), &fit);
-            (!needed).then_some(without)
+            let mut parts = fit.parts.clone();
+            parts.remove(i);
+            // Only whether it comes so far down that the part was worth nothing is asked.
+            let until = Until {
+                iterations: 8,
+                least_chi2: fit.chi2 + least_gain(fit.freedom(), null - fit.chi2),
+            };
+            ctx.fit_towards(parts, Some(fit.soft), mask, until)
         });
         let Some(best) = without
             .into_iter()
-            .flatten()
+            .filter(|w| !worth_it(w, &fit, null))
             .min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
         else {
             break;
@@ -197,7 +197,7 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
             let mut list: Vec<Rival> = Vec::new();
             for other in extensions(
                 ctx,
-                (&without, &FormError::none(ctx)),
+                &without,
                 mask,
                 effort,
                 4,
@@ -310,48 +310,31 @@ fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
     count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
 
-/// The best single effect, its error of form in the balance, and its two rivals; `None` if nothing is worth a name.
+/// The best single effect and its two rivals; `None` if nothing is worth a name.
 fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
-    let none = FormError::none(ctx);
-    let mut singles = extensions(ctx, (null, &none), mask, effort, 8, &[], FREELY);
-    singles.retain(|f| worth_it((ctx, mask), (null, &none), f));
-    singles.truncate(3);
-    let mut singles: Vec<(f64, Fit)> = (singles.into_iter())
-        .map(|fit| {
-            let forms = FormError::of(ctx, &fit, mask, effort.threads);
-            let worth = forms.most_probable(ctx, &fit, mask).worth;
-            (penalised_cost(ctx, &fit) - worth, fit)
-        })
-        .collect();
-    singles.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let mut singles = singles.into_iter().map(|(_, fit)| fit);
-    Some((singles.next()?, singles.collect()))
+    let mut singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
+    singles.retain(|f| worth_it(null, f, null.chi2));
+    let mut singles = singles.into_iter();
+    let best = singles.next()?;
+    Some((best, singles.take(2).collect()))
 }
 
-/// The best set with one more effect than a set; `None` if none is worth it.
+/// The best set with one more effect than a set; `None` if none is worth it. `least` is the least gain that it must promise, `forms` the
+/// sum of squares before the forms of the set.
 fn larger(
     (ctx, mask, effort): (&Context<'_>, &Mask, Effort),
     fit: &Fit,
     beam: &mut Vec<Fit>,
+    (least, forms): (f64, f64),
 ) -> Option<Fit> {
-    let forms = FormError::of(ctx, fit, mask, effort.threads);
-    let mut next = extensions(ctx, (fit, &forms), mask, effort, 6, &[], FREELY);
-    next.retain(|f| worth_it((ctx, mask), (fit, &forms), f));
+    let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
+    next.retain(|f| worth_it(fit, f, forms));
     let top_chi2 = next.first()?.chi2;
     // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
     for other in std::mem::take(beam) {
         let least = 0.5 * (other.chi2 - top_chi2);
         let limits = [least, f64::INFINITY];
-        let forms = FormError::of(ctx, &other, mask, effort.threads);
-        next.extend(extensions(
-            ctx,
-            (&other, &forms),
-            mask,
-            effort,
-            4,
-            &[],
-            limits,
-        ));
+        next.extend(extensions(ctx, &other, mask, effort, 4, &[], limits));
     }
     let cost = |f: &Fit| penalised_cost(ctx, f);
     next.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b)))
@@ -377,7 +360,7 @@ pub(crate) fn search(
     let begun = match start.filter(|f| !f.parts.is_empty()) {
         Some(start) => {
             let again = ctx.fit_from(start.parts.clone(), Some(start.soft), mask, 12);
-            Some((eliminate(ctx, again, mask, effort), Vec::new()))
+            Some((eliminate(ctx, again, &null, mask, effort), Vec::new()))
         }
         None => {
             progress("screening single effects");
@@ -414,10 +397,12 @@ pub(crate) fn search(
             break;
         }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
-        let Some(top) = larger((ctx, mask, effort), &fit, &mut beam) else {
+        let forms = before_forms(ctx, &null, &fit, mask);
+        let least = THRESHOLDS.addition_share * (forms - fit.chi2);
+        let Some(top) = larger((ctx, mask, effort), &fit, &mut beam, (least, forms)) else {
             break;
         };
-        let top = eliminate(ctx, top, mask, effort);
+        let top = eliminate(ctx, top, &null, mask, effort);
         if penalised_cost(ctx, &top) >= penalised_cost(ctx, &fit) {
             break;
         }
@@ -453,7 +438,7 @@ pub(crate) fn search(
         let rich = much_left(&top);
         fit = reparametrise(ctx, top, mask, effort, rich);
         if !alike(&fit.parts, &forms) {
-            fit = eliminate(ctx, fit, mask, effort);
+            fit = eliminate(ctx, fit, &null, mask, effort);
         }
         steps.push((ids(&fit), fit.chi2));
     }

@@ -10,7 +10,7 @@ use crate::search::found::Found;
 use crate::units::figure;
 use crate::verdict::augment::augment;
 use crate::verdict::counted::Counted;
-use crate::verdict::curve::Aside;
+use crate::verdict::form::Aside;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge::{Evidence, judge};
 use crate::verdict::map;
@@ -32,7 +32,7 @@ pub(crate) struct Given<'a> {
     pub threads: usize,
     /// What is to be said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
-    /// What was taken out of the names as no more than a curve.
+    /// What was taken out of the names as another form of the others.
     pub aside: &'a Aside,
 }
 

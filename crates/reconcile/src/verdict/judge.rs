@@ -2,13 +2,12 @@
 
 use crate::data::floor::Floor;
 use crate::fit::context::{Context, Fit};
-use crate::fit::form_error::FormError;
 use crate::search::cost::{leaves_much, left_over, scatter};
 use crate::search::sequential::ids;
 use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;
 use crate::verdict::battery::{self, Column, Hypothesis};
-use crate::verdict::curve::Aside;
+use crate::verdict::form::Aside;
 use crate::verdict::held_out::HeldOut;
 use crate::verdict::hidden;
 use crate::verdict::map::DiscrepancyMap;
@@ -38,7 +37,7 @@ pub(crate) struct Evidence<'a> {
     pub unweighed: bool,
     /// What is said where the records hardly go with the model.
     pub unlike: Option<&'a str>,
-    /// What was taken out of the names as no more than a curve.
+    /// What was taken out of the names as another form of the others.
     pub aside: &'a Aside,
 }
 
@@ -68,15 +67,10 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
     let gained = (excess - left).max(0.0);
     let term = strongest
         .filter(|(_, gain)| *gain > THRESHOLDS.term_least.max(THRESHOLDS.term_share * gained));
-    // What the equations of the set leave if the rig has others.
-    let of_form = FormError::of(ctx, e.fit, &all, threads)
-        .most_probable(ctx, e.fit, &all)
-        .takes_off;
-    let of_form = if excess > 0.0 { of_form / excess } else { 0.0 };
     let much = leaves_much(e.null, e.fit);
     let beyond_chance = much || term.is_some();
-    let mut by_another_form = (e.aside.curved.iter().map(|(_, share)| *share)).chain([of_form]);
-    let remains = beyond_chance || by_another_form.any(|share| share > THRESHOLDS.term_share);
+    let mut companions = e.aside.companions.iter();
+    let remains = beyond_chance || companions.any(|(_, share)| *share > THRESHOLDS.term_share);
     let mut out = Judgement {
         verdict: Verdict::NothingMissing,
         reasons: Vec::new(),
@@ -88,7 +82,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         without_effects(ctx, e, (&library, term), beyond, threads, &mut out);
         return out;
     }
-    // What was set aside is another form of what is named.
+    // Numbers of an equation that is off in its form differ a little from record to record; with the companions they must not.
     let whole = e.aside.whole.as_ref().unwrap_or(e.fit);
     let refused = refusal(ctx, e, closed, left > THRESHOLDS.left_sd * scatter);
     let moved = match refused {
@@ -113,7 +107,8 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         (false, true) => THRESHOLDS.closed_whole,
         (false, false) => THRESHOLDS.remainder_closed,
     };
-    if beyond_chance && (closed + of_form).max(closed_by(whole)) < least {
+    // What was set aside is another form of what is named.
+    if beyond_chance && closed.max(closed_by(whole)) < least {
         out.verdict = Verdict::Unknown;
         out.reasons.push(format!(
             "the best of the catalogue, {}, closes {:.1} % of it, and more than chance is left: no name",
@@ -131,7 +126,7 @@ pub(crate) fn judge(ctx: &Context<'_>, e: &Evidence<'_>, threads: usize) -> Judg
         Verdict::Named
     };
     if remains {
-        let mut left = remainder(ctx, e, (&library, term), (1.0 - closed, of_form));
+        let mut left = remainder(ctx, e, &library, term, 1.0 - closed);
         if let Some(moved) = moved {
             left.how = format!("{}; {}", moved.words, left.how);
         }
@@ -161,7 +156,7 @@ fn without_effects(
     } else if beyond && e.counted {
         // Missing frames are counted, whatever the rest is.
         out.verdict = Verdict::NamedWithRemainder;
-        out.remainder = Some(remainder(ctx, e, (library, term), (1.0, 0.0)));
+        out.remainder = Some(remainder(ctx, e, library, term, 1.0));
     } else if beyond {
         out.verdict = Verdict::Unknown;
         out.reasons
@@ -364,30 +359,25 @@ fn describe(
     out.hypothesis = battery::hypothesis(ctx, fit, library);
 }
 
-/// The remainder next to the names: a share of the gap, `of_form` of it no more than what other equations of the names would explain.
+/// The remainder next to the names.
 fn remainder(
     ctx: &Context<'_>,
     e: &Evidence<'_>,
-    (library, term): (&[Column], Option<(usize, f64)>),
-    (share, of_form): (f64, f64),
+    library: &[Column],
+    term: Option<(usize, f64)>,
+    share: f64,
 ) -> Remainder {
     let mut how: Vec<String> = e
         .aside
-        .curved
+        .companions
         .iter()
         .map(|(id, share)| {
             format!(
-                "{:.2} % of the gap that {id} beside it would explain, and a curve without memory as well",
+                "{:.2} % of the gap that {id} beside it would explain, and another form of the named effect as well",
                 100.0 * share
             )
         })
         .collect();
-    if of_form > 0.5 * share {
-        how.push(format!(
-            "{:.2} % of the gap is what equations that differ from those of the names would explain",
-            100.0 * of_form
-        ));
-    }
     how.extend(term.map(|(i, _)| {
         format!(
             "{} ({} at the {})",

@@ -5,7 +5,7 @@ use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
 use crate::search::found::Rival;
 use crate::thresholds::THRESHOLDS;
-use crate::verdict::curve::WithoutMemory;
+use crate::verdict::form::WithoutMemory;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};
 use crate::verdict::profile;
 use crate::verdict::result::Effect as NamedEffect;

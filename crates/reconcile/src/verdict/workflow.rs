@@ -20,12 +20,13 @@ use crate::thresholds::THRESHOLDS;
 use crate::units::{Scales, Units};
 use crate::verdict::assemble;
 use crate::verdict::augment::COLOURED;
-use crate::verdict::curve::{self, Aside};
+use crate::verdict::form::{self, Aside};
 use crate::verdict::guard;
 use crate::verdict::held_out::{self, HeldOut};
 use crate::verdict::judge;
 use crate::verdict::result::Reconciliation;
 use crate::verdict::searching::{Searched, Searching};
+use crate::verdict::small;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Scope;
 
@@ -171,7 +172,9 @@ fn within(
     ));
     explains_something(&mut found);
     take_back(&ctx, &mut found, effort);
-    let (mut held, aside) = without_curves(&ctx, &mut found, effort, progress);
+    // Without a floor, or next to a model of another rig, no small effect gets a name.
+    let small = floor.source.is_known() && unlike.is_none();
+    let (mut held, aside) = companions(&ctx, &mut found, effort, small, progress);
     // A set that predicts rows worse than no effect at all is none.
     if held.after_um > held.before_um {
         progress(&format!(
@@ -199,17 +202,22 @@ fn within(
     Ok(assemble::assemble(&given, &ctx, found, held))
 }
 
-/// Takes out what a curve without memory explains as well. Makes the held-out check of the final set.
-fn without_curves(
+/// Removes companions that only replace the form of the others. If there are none, adds (`small`) the small effects. Makes the
+/// held-out check of the final set.
+fn companions(
     ctx: &Context<'_>,
     found: &mut Found,
     effort: Effort,
+    small: bool,
     progress: &mut dyn FnMut(&str),
 ) -> (HeldOut, Aside) {
     let held = confirmed(ctx, found, effort.threads, progress);
-    let before = found.fit.parts.clone();
-    let aside = curve::set_aside(ctx, found);
-    if found.fit.parts == before {
+    let count = found.fit.parts.len();
+    let aside = form::set_aside(ctx, found, effort.threads);
+    if small && aside.companions.is_empty() && !found.cut_short {
+        small::add(ctx, found, effort, progress);
+    }
+    if found.fit.parts.len() == count {
         return (held, aside);
     }
     (confirmed(ctx, found, effort.threads, progress), aside)
