@@ -19,9 +19,9 @@ pub struct Thresholds {
     /// Factor, for the error of the noise estimate, on the least gain of an addition in twice the log-likelihood. That gain is the
     /// quantile of chi-square with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
-    /// Least gain of a further response to the command, as a share of the gain explained already. The equations of the first
-    /// effect are not exactly nature's. Pinned by the tests' simulator (relays for play operators).
-    pub addition_share: f64,
+    /// Part of an effect's response by which its equation may differ from the rig's, as a standard deviation. Of the second equations of the
+    /// tests' simulator it is the mean of `sqrt(1 - closure)`: 0.060 of 45 (`reconcile-table seconds 9702`).
+    pub form_error: f64,
     /// Rivals closer than this in twice the log-likelihood count as equal to the winner: e^5 to 1. Pinned by
     /// `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.
     pub tie: f64,
@@ -56,7 +56,7 @@ pub struct Thresholds {
     /// If the main number of a companion is outside the range of known rigs, this share is enough: a creep by a power law leaves a
     /// residual like a relaxation of a millisecond.
     pub companion_untypical: f64,
-    /// An addition smaller than [`Self::addition_share`] must gain this many times the usual least gain. Pinned by
+    /// An addition that the search leaves out because of [`Self::form_error`] must gain this many times the usual least gain. Pinned by
     /// `a_small_effect_of_its_own_is_named_beside_a_large_one`.
     pub small_gain: f64,
     /// A hysteresis gets no name if a curve without memory in front of the plant explains this share of what it explains beyond a gain. For
@@ -128,7 +128,7 @@ pub struct Thresholds {
 /// The numbers in use.
 pub const THRESHOLDS: Thresholds = Thresholds {
     addition_noise: 1.3,
-    addition_share: 0.0015,
+    form_error: 0.06,
     tie: 10.0,
     closed_least: 0.80,
     closed_whole: 0.985,

@@ -18,10 +18,17 @@ pub(crate) fn threshold(freedom: usize) -> f64 {
     THRESHOLDS.addition_noise * chi2_quantile(freedom as f64, CHANCE_SD)
 }
 
-/// Least gain of a further response to the command over a set that explains `gained`: beyond chance, and beyond the difference between
-/// the equations and nature's.
-pub(crate) fn least_gain(freedom: usize, gained: f64) -> f64 {
-    threshold(freedom).max(THRESHOLDS.addition_share * gained)
+/// Least gain of a further response to the command over a set that explains `gained` by equations which may differ from nature's.
+///
+/// The difference is a response too, [`Thresholds::form_error`](crate::thresholds::Thresholds::form_error) times as large, and may look like
+/// any of the catalogue's numbers: as many directions, all alike. Along each it adds `form_error^2 gained / numbers` to the variance of the
+/// noise, which is 1; a gain counts in units of the sum.
+pub(crate) fn least_gain(ctx: &Context<'_>, freedom: usize, gained: f64) -> f64 {
+    let numbers: usize = (ctx.variants.iter())
+        .map(|v| v.candidate().params.len())
+        .sum();
+    let along = THRESHOLDS.form_error.powi(2) * gained.max(0.0) / numbers.max(1) as f64;
+    threshold(freedom) * (1.0 + along)
 }
 
 /// Least gain of the best of this number of waves, each with its sine and cosine: the tail of chi-square with two degrees is

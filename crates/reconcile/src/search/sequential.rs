@@ -124,7 +124,7 @@ fn own(ctx: &Context<'_>, fit: &Fit, mask: &Mask, effort: Effort, forbidden: &[&
 }
 
 /// Whether the part of `bigger` that `smaller` lacks is worth having; `null` is the sum of squares before the forms of `smaller`.
-fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
+fn worth_it(ctx: &Context<'_>, smaller: &Fit, bigger: &Fit, null: f64) -> bool {
     let added = bigger.freedom().saturating_sub(smaller.freedom()).max(1);
     let off_response = bigger
         .parts
@@ -136,7 +136,7 @@ fn worth_it(smaller: &Fit, bigger: &Fit, null: f64) -> bool {
     } else {
         null - smaller.chi2
     };
-    smaller.chi2 - bigger.chi2 > least_gain(added, gained)
+    smaller.chi2 - bigger.chi2 > least_gain(ctx, added, gained)
 }
 
 /// Takes back effects that are no longer needed.
@@ -150,13 +150,13 @@ fn eliminate(ctx: &Context<'_>, mut fit: Fit, null: &Fit, mask: &Mask, effort: E
             // Only whether it comes so far down that the part was worth nothing is asked.
             let until = Until {
                 iterations: 8,
-                least_chi2: fit.chi2 + least_gain(fit.freedom(), null - fit.chi2),
+                least_chi2: fit.chi2 + least_gain(ctx, fit.freedom(), null - fit.chi2),
             };
             ctx.fit_towards(parts, Some(fit.soft), mask, until)
         });
         let Some(best) = without
             .into_iter()
-            .filter(|w| !worth_it(w, &fit, null))
+            .filter(|w| !worth_it(ctx, w, &fit, null))
             .min_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)))
         else {
             break;
@@ -313,7 +313,7 @@ fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
 /// The best single effect and its two rivals; `None` if nothing is worth a name.
 fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
     let mut singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
-    singles.retain(|f| worth_it(null, f, null.chi2));
+    singles.retain(|f| worth_it(ctx, null, f, null.chi2));
     let mut singles = singles.into_iter();
     let best = singles.next()?;
     Some((best, singles.take(2).collect()))
@@ -328,7 +328,7 @@ fn larger(
     (least, forms): (f64, f64),
 ) -> Option<Fit> {
     let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
-    next.retain(|f| worth_it(fit, f, forms));
+    next.retain(|f| worth_it(ctx, fit, f, forms));
     let top_chi2 = next.first()?.chi2;
     // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
     for other in std::mem::take(beam) {
@@ -398,7 +398,7 @@ pub(crate) fn search(
         }
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
         let forms = before_forms(ctx, &null, &fit, mask);
-        let least = THRESHOLDS.addition_share * (forms - fit.chi2);
+        let least = least_gain(ctx, 1, forms - fit.chi2);
         let Some(top) = larger((ctx, mask, effort), &fit, &mut beam, (least, forms)) else {
             break;
         };

@@ -1,13 +1,13 @@
 //! Small effects next to large ones, which the search leaves out: looked for last, under the strictest conditions.
 //!
 //! An effect that explains a thousandth of the gap may be the difference between the catalogue's equation of a large effect and
-//! the rig's. So the search asks for more (`addition_share`). But a slow creep together with a delay explains no more either, and
+//! the rig's. So the search asks for more (`least_gain`). But a slow creep together with a delay explains no more either, and
 //! yet spoils the free run. At the end the two cases can be separated. If the small effect is real, freer forms of the large ones
 //! have nothing left to take up. If it only replaces their form, they gain in addition to it. If something was set aside, the form
 //! of the large effects is known to differ, and nothing small is looked for.
 
 use crate::fit::context::{Context, Fit};
-use crate::search::cost::{before_forms, penalised_cost, prior_penalty, threshold};
+use crate::search::cost::{before_forms, least_gain, penalised_cost, prior_penalty, threshold};
 use crate::search::effort::Effort;
 use crate::search::found::Found;
 use crate::search::sequential::{FREELY, extensions, ids, settle};
@@ -63,7 +63,7 @@ fn stands(ctx: &Context<'_>, found: &Found, top: &Fit, others: &[Fit], threads: 
         part.variant.is_gain() && top.parts.iter().any(|p| p.variant.has_two_gains());
     // What gains more was weighed by the search.
     let began = before_forms(ctx, &found.null, &found.fit, &ctx.problem.all());
-    let most = THRESHOLDS.addition_share * (began - found.fit.chi2);
+    let most = least_gain(ctx, added, began - found.fit.chi2);
     gained < most
         && gained > THRESHOLDS.small_gain * threshold(added)
         && part.matters()
