@@ -27,8 +27,12 @@ pub(crate) fn least_gain(ctx: &Context<'_>, freedom: usize, gained: f64) -> f64 
     let numbers: usize = (ctx.variants.iter())
         .map(|v| v.candidate().params.len())
         .sum();
-    let along = THRESHOLDS.form_error.powi(2) * gained.max(0.0) / numbers.max(1) as f64;
-    threshold(freedom) * (1.0 + along)
+    threshold(freedom) * (1.0 + along_a_number(numbers, gained))
+}
+
+/// Variance that an error of form adds to the noise along each of the catalogue's numbers.
+fn along_a_number(numbers: usize, gained: f64) -> f64 {
+    THRESHOLDS.form_error.powi(2) * gained.max(0.0) / numbers.max(1) as f64
 }
 
 /// Least gain of the best of this number of waves, each with its sine and cosine: the tail of chi-square with two degrees is
@@ -136,6 +140,14 @@ fn beyond((low, high): (f64, f64), x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_error_of_form_as_large_as_the_noise_along_each_number_doubles_the_least_gain() {
+        // 6 % of a response of 400 numbers times (1 / 0.06)^2 is 400: one along each.
+        let gained = 400.0 / THRESHOLDS.form_error.powi(2);
+        assert!((along_a_number(400, gained) - 1.0).abs() < 1e-12);
+        assert_eq!(along_a_number(400, -5.0), 0.0);
+    }
 
     #[test]
     fn a_number_a_little_beyond_the_range_of_rigs_costs_a_little() {
