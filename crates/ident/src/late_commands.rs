@@ -310,8 +310,8 @@ pub fn as_if_on_time(
     }
 }
 
-/// RMS of the increments of the position that the linear motion leaves, over the RMS of its own. The share of the chip that is not linear
-/// is smaller, because the noise is in it.
+/// RMS of the increments of the position without the linear motion, over the RMS of the increments of that motion. The nonlinear share of
+/// the chip is smaller, because this ratio contains the noise.
 fn left_share(position_um: &[f64], due_um: &[f64], late: &[bool]) -> f64 {
     let all = vec![0.0; position_um.len()];
     let squares = |less: &[f64]| -> f64 {

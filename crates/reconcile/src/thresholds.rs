@@ -19,8 +19,8 @@ pub struct Thresholds {
     /// Factor, for the error of the noise estimate, on the least gain of an addition in twice the log-likelihood. That gain is the
     /// quantile of chi-square with its degrees of freedom at `CHANCE_SD`. Pinned by `records_that_hide_nothing_get_no_name`.
     pub addition_noise: f64,
-    /// Part of an effect's response by which its equation may differ from the rig's, as a standard deviation. Of the second equations of the
-    /// tests' simulator it is the mean of `sqrt(1 - closure)`: 0.060 of 45 (`reconcile-table seconds 9702`).
+    /// Part of an effect's response by which its equation may differ from the rig's, as a standard deviation. About the mean of
+    /// `sqrt(1 - closure)` of the second equations of the tests' simulator (`reconcile-table seconds SEED` prints each closure).
     pub form_error: f64,
     /// Rivals closer than this in twice the log-likelihood count as equal to the winner: e^5 to 1. Pinned by
     /// `a_lag_of_the_driver_is_named_with_the_bubble_as_its_alternative`.

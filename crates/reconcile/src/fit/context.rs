@@ -48,7 +48,7 @@ pub(crate) struct WhiteEvidence {
 }
 
 impl WhiteEvidence {
-    /// What the noise of a problem says, if `trusted` increments told it.
+    /// The evidence in the noise of a problem; `trusted` is the number of increments that the noise was estimated from.
     pub(crate) fn of(model: &Model, trusted: usize, problem: &Problem) -> Option<Self> {
         let noise = &problem.noise;
         let exposure_s = problem

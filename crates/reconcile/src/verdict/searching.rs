@@ -304,7 +304,7 @@ impl Searching<'_> {
                 Some(weighed.fit),
                 &mut *progress,
             );
-            // The zero flow beside this very set was estimated.
+            // The zero flow was estimated next to this very set.
             if alike(&moving.found.fit.parts, &set) {
                 break;
             }

@@ -74,8 +74,8 @@ pub struct Delivered {
 }
 
 impl Delivered {
-    /// The rows without the first ones, in which the loop brings the bead to its target: the commands are larger than any of the experiment,
-    /// and what the board did before is not known.
+    /// The rows without the first ones, in which the loop brings the bead to its target. There the commands may be larger than any of the
+    /// experiment, and the commands before them are not known.
     pub(crate) fn since_caught(&self) -> Self {
         const CAUGHT: usize = SETTLE_TICKS / 2;
         fn tail<T: Copy>(all: &[T]) -> Vec<T> {
