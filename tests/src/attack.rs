@@ -89,9 +89,9 @@ struct Ended {
     err: String,
 }
 
-/// Waits for a child, at most for [`PATIENCE`]; a child that does not end is killed and said to be broken.
+/// Waits for a child, at most for twice [`PATIENCE`]; a child that does not end is killed and said to be broken.
 fn wait(mut child: Child, what: &str, attacked: &mut Attacked) -> Option<Ended> {
-    let deadline = Instant::now() + 4 * PATIENCE;
+    let deadline = Instant::now() + 2 * PATIENCE;
     while child.try_wait().ok()?.is_none() {
         if Instant::now() > deadline {
             let _ = child.kill();
