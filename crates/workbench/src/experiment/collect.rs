@@ -208,16 +208,16 @@ pub fn record_name(file: &Path) -> String {
     )
 }
 
-/// A run as a record.
+/// A run as a record, since the bead was caught.
 fn record(acquired: &Acquired, file: &Path, period_s: f64) -> Result<Record, Failure> {
-    let mut record = of_rows(&record_name(file), &acquired.rows, period_s)?;
+    let mut record = of_rows(&record_name(file), &acquired.rows.since_caught(), period_s)?;
     record.exposure_s = acquired.exposure_s;
     record.slew_um_per_s = acquired.slew_um_per_s;
     Ok(record)
 }
 
-/// The ticks of a run with a closed loop as a record since the bead was caught, row by row of the camera: a tick that is early or late, or
-/// never comes, moves no row. A stall leaves open when the board had the commands of its rows.
+/// The ticks of a run with a closed loop as a record, row by row of the camera: a tick that is early or late, or never comes, moves no row. A
+/// stall leaves open when the board had the commands of its rows.
 ///
 /// # Errors
 /// Ticks that are no record, with what a record needs.
@@ -227,16 +227,15 @@ pub fn of_ticks(name: &str, ticks: &[TickRecord], period_s: f64) -> Result<Recor
 }
 
 fn of_rows(name: &str, rows: &Delivered, period_s: f64) -> Result<Record, Failure> {
-    let rows = rows.since_caught();
     let time_s: Vec<f64> = (0..rows.pzt_um.len())
         .map(|k| k as f64 * period_s)
         .collect();
     let mut record =
         Record::from_rows(name, &time_s, &rows.pzt_um, &rows.bead_um).map_err(refused)?;
-    record.unseen = rows.unseen;
-    record.frame_age_s = rows.frame_age_s;
-    record.late_command = rows.late_command;
-    record.late_motion_um = rows.late_motion_um;
+    record.unseen.clone_from(&rows.unseen);
+    record.frame_age_s.clone_from(&rows.frame_age_s);
+    record.late_command.clone_from(&rows.late_command);
+    record.late_motion_um.clone_from(&rows.late_motion_um);
     Ok(record)
 }
 
