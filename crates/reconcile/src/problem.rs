@@ -280,7 +280,7 @@ impl Problem {
             .iter()
             .zip(repeated)
             .zip(waits(records, base.frame_age_s))
-            .map(|((r, repeated), waits_s)| {
+            .map(|((r, repeated), waits)| {
                 // How a sampled analogue input came from where it was before the record to its first sample is not known.
                 let run_in = if base.interpolated_input {
                     ((RUN_IN_S / base.sample_s) as usize).min(r.rows() / 10)
@@ -310,7 +310,7 @@ impl Problem {
                 let flow = flow_paths(&base, r.rows());
                 let sampling = Sampling {
                     exposure_s: r.exposure_s,
-                    waits_s,
+                    waits,
                 };
                 let mut prepared = Prepared {
                     model_errors: errors.responses(&u, &sampling, &[]),

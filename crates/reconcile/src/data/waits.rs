@@ -5,31 +5,35 @@
 //! the waits finds another delay in every record, and a lag that seems to vary with the amplitude.
 
 use crate::data::record::Record;
+use crate::simulate::Waits;
 
 /// Rows of the running median: long against the jitter of single frames, short against the drift of two clocks.
 const ROWS: usize = 51;
-/// Waits below this part of a row are the jitter of the stamps.
+/// Less than this part of a row is the jitter of the stamps.
 const LEAST: f64 = 0.01;
 /// Share of the rows that are taken to have waited least, if no age is stated: their age is that of the camera's path alone.
 const YOUNGEST: f64 = 0.1;
 
-/// Waits of the rows of every record \[s\]: how much older their frames are than those of the model's delay, else than the youngest. None
+/// Waits of the rows of every record: how much older their frames are than those of the model's delay, else than the youngest. None
 /// for a record without ages, and for all if no frame waited.
-pub(crate) fn waits(records: &[Record], stated_s: Option<f64>) -> Vec<Vec<f64>> {
-    let mut ages: Vec<Vec<f64>> = records.iter().map(|r| smooth(&r.frame_age_s)).collect();
+pub(crate) fn waits(records: &[Record], stated_s: Option<f64>) -> Vec<Waits> {
+    let ages: Vec<Vec<f64>> = records.iter().map(|r| smooth(&r.frame_age_s)).collect();
     let mut sorted: Vec<f64> = ages.iter().flatten().copied().collect();
     sorted.sort_by(f64::total_cmp);
     let youngest_s = sorted.get((YOUNGEST * sorted.len() as f64) as usize);
     let Some(from_s) = stated_s.or(youngest_s.copied()) else {
-        return ages;
+        return vec![Waits::default(); records.len()];
     };
-    for (ages, r) in ages.iter_mut().zip(records) {
-        ages.iter_mut().for_each(|age| *age -= from_s);
-        if ages.iter().all(|age| age.abs() < LEAST * r.sample_s) {
-            ages.clear();
+    let of = |(ages, r): (&Vec<f64>, &Record)| {
+        let step_s = LEAST * r.sample_s;
+        let waited = ages.iter().any(|age| (age - from_s).abs() >= step_s);
+        let steps = |age: &f64| ((age - from_s) / step_s).round() as i16;
+        Waits {
+            step_s,
+            of_row: ages.iter().filter(|_| waited).map(steps).collect(),
         }
-    }
-    ages
+    };
+    ages.iter().zip(records).map(of).collect()
 }
 
 /// The median of the known ages about each row; before the first known one the first.
@@ -81,13 +85,18 @@ mod tests {
         let second: Vec<f64> = (0..2000).map(|k| 2.1e-3 + jitter(k)).collect();
         let records = [record(first.clone()), record(second), record(Vec::new())];
         let all = waits(&records, None);
-        assert!((all[0][1200] - 2.5e-4).abs() < 1e-5, "{}", all[0][1200]);
-        assert!(all[0][500].abs() < 1e-5 && (all[1][700] - 1e-4).abs() < 1e-5);
-        assert!(all[2].is_empty());
+        let wait_s = |record: usize, row: usize| all[record].of_row_s(row);
+        assert!(
+            (wait_s(0, 1200) - 2.5e-4).abs() < 1e-5,
+            "{}",
+            wait_s(0, 1200)
+        );
+        assert!(wait_s(0, 500).abs() < 1e-5 && (wait_s(1, 700) - 1e-4).abs() < 1e-5);
+        assert!(all[2].of_row.is_empty());
         let calm: Vec<f64> = (0..2000).map(|k| 2e-3 + 0.3 * jitter(k)).collect();
-        assert!(waits(&[record(calm.clone())], None)[0].is_empty());
+        assert!(waits(&[record(calm.clone())], None)[0].of_row.is_empty());
         // A model that was made with frames of 1.9 ms: these waited for 0.1 ms longer.
         let waited = &waits(&[record(calm)], Some(1.9e-3))[0];
-        assert!(waited.iter().all(|s| (s - 1e-4).abs() < 1e-5));
+        assert!((0..2000).all(|k| (waited.of_row_s(k) - 1e-4).abs() < 1e-5));
     }
 }

@@ -16,13 +16,30 @@ pub(super) struct Frames {
 pub(crate) struct Sampling {
     /// Exposure about the middle of each frame, if it is known \[s\].
     pub exposure_s: f64,
-    /// How much older each frame is at its command than the frames that did not wait for it \[s\]; empty: none waited.
-    pub waits_s: Vec<f64>,
+    pub waits: Waits,
+}
+
+/// How much older each frame is at its command than the frames that did not wait for it, in steps of the stamps' jitter.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Waits {
+    pub step_s: f64,
+    /// Steps of each row; empty: no frame waited.
+    pub of_row: Vec<i16>,
+}
+
+impl Waits {
+    /// Wait of a row \[s\].
+    #[inline]
+    pub(crate) fn of_row_s(&self, row: usize) -> f64 {
+        self.of_row
+            .get(row)
+            .map_or(0.0, |steps| f64::from(*steps) * self.step_s)
+    }
 }
 
 impl Sampling {
     pub(super) fn is_plain(&self) -> bool {
-        self.exposure_s == 0.0 && self.waits_s.is_empty()
+        self.exposure_s == 0.0 && self.waits.of_row.is_empty()
     }
 }
 
@@ -75,34 +92,43 @@ pub(crate) fn sample(
         return;
     }
     let known = sampling.exposure_s;
-    let path = Path::new(t, h, exposure > 0.0 || known > 0.0);
+    let path = Path { t, h };
     let sample_s = h * fine as f64;
     // A frame that close behind an edge shows the share of the edge, as one that close in front of it does. Otherwise a delay of
     // whole frames would be a cliff, and a fit on top of it takes no step.
     let whole = near_whole(delay / sample_s).filter(|_| sampling.is_plain());
     let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
-    for k in 0..rows {
-        let wait = sampling.waits_s.get(k).copied().unwrap_or(0.0);
-        let at = k as f64 * sample_s * (1.0 + skew) - delay - wait;
-        // A held command bends the path within an exposure, so points of it would not do for its mean.
-        let seen = |at: f64| path.mean(at - exposure, at);
-        y.push(if known > 0.0 && exposure == 0.0 {
-            path.mean(at - 0.5 * known, at + 0.5 * known)
-        } else if known > 0.0 {
+    // A held command bends the path within an exposure, so points of it would not do for its mean.
+    let window = match (known > 0.0, exposure > 0.0) {
+        (true, false) => Some((-0.5 * known, 0.5 * known)),
+        (false, true) => Some((-exposure, 0.0)),
+        _ => None,
+    };
+    let at = |k: usize| k as f64 * sample_s * (1.0 + skew) - delay - sampling.waits.of_row_s(k);
+    if let Some((from, to)) = window {
+        if skew == 0.0 {
+            let window = (from - delay, to - delay);
+            path.means(window, &sampling.waits, (fine, rows), y);
+        } else {
+            y.extend((0..rows).map(|k| path.mean(at(k) + from, at(k) + to)));
+        }
+        return;
+    }
+    y.extend((0..rows).map(|k| {
+        let at = at(k);
+        if known > 0.0 {
             // Without bends by the inner mean: two points by Gauss in each half.
             let near = known * (0.25 - 0.25 / 3f64.sqrt());
             let far = known * (0.25 + 0.25 / 3f64.sqrt());
-            0.25 * (seen(at - far) + seen(at - near) + seen(at + near) + seen(at + far))
-        } else if exposure > 0.0 {
-            seen(at)
-        } else {
-            let shown = edge
-                .and_then(|w| k.checked_sub(w))
-                .filter(|edge| path.step_of(at).0 == edge * fine)
-                .map_or(0.0, |edge| t.jump[edge * fine]);
-            path.position(at) - shown
-        });
-    }
+            let seen = |at: f64| path.mean(at - exposure, at);
+            return 0.25 * (seen(at - far) + seen(at - near) + seen(at + near) + seen(at + far));
+        }
+        let shown = edge
+            .and_then(|w| k.checked_sub(w))
+            .filter(|edge| path.step_of(at).0 == edge * fine)
+            .map_or(0.0, |edge| t.jump[edge * fine]);
+        path.position(at) - shown
+    }));
 }
 
 /// The whole number of frames to which a delay (in frames) is so close that the frames are at the edges of the command.
@@ -116,44 +142,38 @@ pub(crate) fn near_whole(frames: f64) -> Option<usize> {
 struct Path<'a> {
     t: &'a Trace,
     h: f64,
-    /// Integral of the position from the start to each step.
-    area: Vec<f64>,
 }
 
-impl<'a> Path<'a> {
-    fn new(t: &'a Trace, h: f64, with_area: bool) -> Self {
-        let mut path = Self {
-            t,
-            h,
-            area: Vec::new(),
-        };
-        if with_area && let Some(last) = t.pos.len().checked_sub(1) {
-            // The integral of a cubic by its ends and its slopes there.
-            let slopes = t.start_slope.iter().zip(&t.end_slope);
-            let steps = t.pos.iter().zip(&t.pos[1..]).zip(&t.jump).zip(slopes);
-            let (mut sum, part) = (0.0, h / 12.0);
-            path.area.reserve(last + 1);
-            path.area.extend(steps.map(|(((from, to), jump), (a, b))| {
-                let before = sum;
-                sum += h * (0.5 * (from + jump + to) + part * (a - b));
-                before
-            }));
-            path.area.push(sum);
-        }
-        path
-    }
+/// Integral of a cubic over a part of its step (in steps), as weights of its start, its rise, and its slopes at start and end times the
+/// step.
+#[inline]
+fn area(part: f64) -> [f64; 4] {
+    const THIRD: f64 = 1.0 / 3.0;
+    let (square, cube) = (part * part, part * part * part);
+    let fourth = 0.25 * square * square;
+    [
+        part,
+        cube - 2.0 * fourth,
+        0.5 * square - 2.0 * THIRD * cube + fourth,
+        fourth - THIRD * cube,
+    ]
+}
 
-    /// Coefficients of `c0 + c1 f + c2 f^2 + c3 f^3`, f in 0..1 of step j.
+/// [`area`] of a whole step.
+const WHOLE: [f64; 4] = [1.0, 0.5, 1.0 / 12.0, -1.0 / 12.0];
+
+impl Path<'_> {
+    /// Start of step j, its rise, and its slopes times the step.
     #[inline]
-    fn cubic(&self, j: usize) -> [f64; 4] {
+    fn step(&self, j: usize) -> [f64; 4] {
         let t = self.t;
         let start = t.pos[j] + t.jump[j];
         let (a, b) = (t.start_slope[j] * self.h, t.end_slope[j] * self.h);
-        let d = match t.pos.get(j + 1) {
+        let rise = match t.pos.get(j + 1) {
             Some(end) => end - start,
             None => 0.5 * (a + b),
         };
-        [start, a, 3.0 * d - 2.0 * a - b, a + b - 2.0 * d]
+        [start, rise, a, b]
     }
 
     #[inline]
@@ -173,34 +193,102 @@ impl<'a> Path<'a> {
             return self.t.pos[0];
         }
         let (j, f) = self.step_of(at);
-        let c = self.cubic(j);
+        let [start, rise, a, b] = self.step(j);
         if f > 1.0 {
             // Past the record's end: go on straight.
-            return c[0] + c[1] + c[2] + c[3] + (f - 1.0) * self.t.end_slope[j] * self.h;
+            return start + rise + (f - 1.0) * b;
         }
-        c[0] + f * (c[1] + f * (c[2] + f * c[3]))
-    }
-
-    /// Integral over the part `f` of step j.
-    #[inline]
-    fn partial_area(&self, j: usize, f: f64) -> f64 {
-        const THIRD: f64 = 1.0 / 3.0;
-        let c = self.cubic(j);
-        self.h * f * (c[0] + f * (0.5 * c[1] + f * (THIRD * c[2] + f * (0.25 * c[3]))))
+        start + f * (a + f * (3.0 * rise - 2.0 * a - b + f * (a + b - 2.0 * rise)))
     }
 
     /// Mean between two instants.
     fn mean(&self, from: f64, to: f64) -> f64 {
-        (self.integral(to) - self.integral(from)) / (to - from)
+        let rest = self.t.pos[0];
+        if to <= 0.0 {
+            return rest;
+        }
+        // Before the record the bead stood still.
+        let before = from.min(0.0) * rest;
+        let window = Window::new(self.step_of(from.max(0.0)), self.step_of(to));
+        (window.sum(self, 0) * self.h - before) / (to - from)
     }
 
-    #[inline]
-    fn integral(&self, at: f64) -> f64 {
-        if at <= 0.0 {
-            return at * self.t.pos[0];
+    /// Means between two instants about every row, earlier by its wait, of `fine` steps to a row.
+    fn means(
+        &self,
+        (from, to): (f64, f64),
+        waits: &Waits,
+        (fine, rows): (usize, usize),
+        y: &mut Vec<f64>,
+    ) {
+        let row_s = self.h * fine as f64;
+        let steps_of = |row: usize| waits.of_row.get(row).copied().unwrap_or(0);
+        let (least, most) = (0..rows)
+            .map(steps_of)
+            .fold((i16::MAX, 0), |(least, most), steps| {
+                (least.min(steps), most.max(steps))
+            });
+        // Where a window lies depends on its row's wait alone: each is laid out once, at a row that has it all behind it.
+        let reach_s = f64::from(most) * waits.step_s - from;
+        let at = (reach_s / row_s).ceil().max(0.0) as usize + 1;
+        let mut laid_out: Vec<Option<Window>> = Vec::new();
+        laid_out.resize_with(usize::from(most.abs_diff(least)) + 1, || None);
+        y.extend((0..rows).map(|k| {
+            let mid = k as f64 * row_s - waits.of_row_s(k);
+            let alone = || self.mean(mid + from, mid + to);
+            let Some(later) = k.checked_sub(at).filter(|_| at < rows) else {
+                return alone();
+            };
+            let of_wait = &mut laid_out[usize::from(steps_of(k).abs_diff(least))];
+            let window = of_wait.get_or_insert_with(|| {
+                let mid = at as f64 * row_s - waits.of_row_s(k);
+                Window::new(self.step_of(mid + from), self.step_of(mid + to))
+            });
+            match window.last + later * fine < self.t.pos.len() {
+                true => window.sum(self, later * fine) * self.h / (to - from),
+                false => alone(),
+            }
+        }));
+    }
+}
+
+/// From a point of one step to a point of the same or a later one.
+struct Window {
+    first: usize,
+    last: usize,
+    /// Weights of the first step, and of the last one if it is another.
+    begun: [f64; 4],
+    end: [f64; 4],
+}
+
+impl Window {
+    fn new((first, since): (usize, f64), (last, until): (usize, f64)) -> Self {
+        let (before, end) = (area(since), area(until.min(1.5)));
+        let until_end = if first == last { end } else { WHOLE };
+        Self {
+            first,
+            last,
+            begun: [0, 1, 2, 3].map(|i| until_end[i] - before[i]),
+            end,
         }
-        let (j, f) = self.step_of(at);
-        self.area[j] + self.partial_area(j, f.min(1.5))
+    }
+
+    /// Integral over it and a number of steps later, in steps.
+    #[inline]
+    fn sum(&self, path: &Path<'_>, later: usize) -> f64 {
+        let of = |weights: &[f64; 4], j: usize| {
+            let [start, rise, a, b] = path.step(j);
+            (weights[0] * start + weights[1] * rise) + (weights[2] * a + weights[3] * b)
+        };
+        let (first, last) = (self.first + later, self.last + later);
+        let mut sum = of(&self.begun, first);
+        if first < last {
+            for j in first + 1..last {
+                sum += of(&WHOLE, j);
+            }
+            sum += of(&self.end, last);
+        }
+        sum
     }
 }
 
@@ -221,7 +309,7 @@ mod tests {
         };
         let sampling = Sampling {
             exposure_s: 0.5,
-            waits_s: Vec::new(),
+            waits: Waits::default(),
         };
         let mut y = Vec::new();
         let mut at_bend = |frames: Frames| {
@@ -239,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn the_integral_to_each_step_is_that_of_the_steps_before_it() {
+    fn the_mean_between_two_instants_is_that_of_the_positions_between_them() {
         let of = |f: fn(f64) -> f64| -> Vec<f64> { (0..50).map(|k| f(f64::from(k))).collect() };
         let t = Trace {
             pos: of(|k| (0.7 * k).sin()),
@@ -248,12 +336,49 @@ mod tests {
             end_slope: of(|k| 30.0 * (1.3 * k).cos()),
         };
         let h = 1e-3;
-        let path = Path::new(&t, h, true);
-        let mut sum = 0.0;
-        for (j, area) in path.area.iter().enumerate() {
-            assert!((area - sum).abs() < 1e-15, "{j}: {area} {sum}");
-            sum += path.partial_area(j, 1.0);
+        let path = Path { t: &t, h };
+        for (from, to) in [
+            (0.2, 0.7),
+            (3.1, 3.9),
+            (7.6, 8.3),
+            (9.25, 14.5),
+            (-2.0, 1.5),
+        ] {
+            let parts = 700_000;
+            let at = |k: i32| h * (from + (to - from) * (f64::from(k) + 0.5) / f64::from(parts));
+            let sum: f64 = (0..parts).map(|k| path.position(at(k))).sum();
+            let (mean, dense) = (path.mean(from * h, to * h), sum / f64::from(parts));
+            assert!(
+                (mean - dense).abs() < 1e-5,
+                "{from} to {to}: {mean} {dense}"
+            );
         }
-        assert_eq!(path.area.len(), 50);
+        assert_eq!(path.mean(-2.0 * h, -h), t.pos[0]);
+        // The same about every row, of one step or of five.
+        for (from, to) in [
+            (-0.2, 0.3),
+            (-2.7, -2.2),
+            (-2.25, -1.75),
+            (-6.0, 0.0),
+            (0.4, 1.7),
+        ] {
+            for fine in [1, 5] {
+                let mut means = Vec::new();
+                let waits = Waits {
+                    step_s: 0.1 * h,
+                    of_row: (0..50 / fine as i16).map(|k| k % 7 - 1).collect(),
+                };
+                path.means((from * h, to * h), &waits, (fine, 50 / fine), &mut means);
+                assert_eq!(means.len(), 50 / fine);
+                for (k, mean) in means.iter().enumerate() {
+                    let at = (k * fine) as f64 - waits.of_row_s(k) / h;
+                    let alone = path.mean((at + from) * h, (at + to) * h);
+                    assert!(
+                        (mean - alone).abs() < 1e-9,
+                        "{from} to {to}, {k}: {mean} {alone}"
+                    );
+                }
+            }
+        }
     }
 }

@@ -272,15 +272,22 @@ impl Modal {
     /// A sample has `fine` steps. If the input is constant over the sample, the modes advance by whole samples.
     pub(super) fn trace(&self, u: &[f64], fine: usize, t: &mut Trace) {
         t.clear(u.len());
-        let mut before = 0.0;
-        for &u in u {
-            t.jump.push(self.direct * (u - before));
-            before = u;
-        }
+        let before = std::iter::once(&0.0).chain(u);
+        let jumps = u.iter().zip(before).map(|(u, before)| u - before);
+        t.jump.extend(jumps.map(|step| self.direct * step));
         match fine {
             4 => self.held::<4, 8>(u, t),
             10 => self.held::<10, 20>(u, t),
-            _ => self.held::<1, 2>(u, t),
+            _ => self.steps(u, t),
+        }
+        // The slope at the end of a step is that at the start of the next, without the immediate effect of the next input.
+        let last = t.end_slope.pop().unwrap_or(0.0);
+        let next = t.start_slope.iter().zip(u).skip(1).zip(u);
+        let change =
+            |((slope, after), u): ((&f64, &f64), &f64)| slope + self.slope_direct * (u - after);
+        t.end_slope.extend(next.map(change));
+        if let Some(u) = u.last() {
+            t.end_slope.push(last + self.slope_direct * u);
         }
         if !self.complex.is_empty() {
             self.add_complex(u, t);
@@ -312,8 +319,7 @@ impl Modal {
         let mut before = 0.0;
         for piece in u.chunks(FINE) {
             let first = piece[0];
-            // A single step gains nothing by the tables.
-            if FINE > 1 && piece.len() == FINE && piece.iter().all(|u| *u == first) {
+            if piece.len() == FINE && piece.iter().all(|u| *u == first) {
                 let mut out = of_input.map(|x| x * first);
                 for ((tables, far), z) in of_state.iter().zip(&far).zip(&mut states) {
                     for (i, (table, z)) in tables.iter().zip(z).enumerate() {
@@ -344,21 +350,31 @@ impl Modal {
                 before = u;
             }
         }
-        // The slope at the end of a step is that at the start of the next, without the immediate effect of the next input.
-        let last: f64 = self
-            .real
-            .iter()
-            .zip(&states)
-            .map(|(four, z)| (0..4).map(|i| four.s[i] * z[i]).sum::<f64>())
-            .sum();
-        let n = u.len();
-        t.end_slope.extend((1..n).map(|k| {
-            let of_next = t.start_slope[k] - self.slope_direct * u[k];
-            of_next + self.slope_direct * u[k - 1]
-        }));
-        if let Some(u) = u.last() {
-            t.end_slope.push(last + self.slope_direct * u);
+        t.end_slope.push(self.slope_of(&states));
+    }
+
+    /// The same, one step at a time.
+    fn steps(&self, u: &[f64], t: &mut Trace) {
+        let mut states = vec![[0.0; 4]; self.real.len()];
+        let mut before = 0.0;
+        t.pos.resize(u.len(), 0.0);
+        t.start_slope.resize(u.len(), 0.0);
+        for ((&u, pos), slope) in u.iter().zip(&mut t.pos).zip(&mut t.start_slope) {
+            let (mut y, mut v) = ([0.0; 4], [0.0; 4]);
+            for (four, z) in self.real.iter().zip(&mut states) {
+                four.step(z, u, &mut y, &mut v);
+            }
+            *pos = self.direct * before + sum(y);
+            *slope = self.slope_direct * u + sum(v);
+            before = u;
         }
+        t.end_slope.push(self.slope_of(&states));
+    }
+
+    /// Slope that the real modes give.
+    fn slope_of(&self, states: &[[f64; 4]]) -> f64 {
+        let of = |(four, z): (&Four, &[f64; 4])| (0..4).map(|i| four.s[i] * z[i]).sum::<f64>();
+        self.real.iter().zip(states).map(of).sum()
     }
 
     fn add_complex(&self, u: &[f64], t: &mut Trace) {
