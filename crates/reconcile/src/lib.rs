@@ -41,6 +41,7 @@ mod problem;
 mod report;
 mod search;
 mod simulate;
+mod start;
 mod thresholds;
 mod units;
 mod verdict;

@@ -14,13 +14,11 @@ use crate::dot::dot;
 use crate::mask::Mask;
 use crate::model_error::STEP;
 use crate::simulate::{Base, Effect, Input, Sampling, simulate};
+use crate::start::{run_in, transients};
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-
-/// Start of a record with an analogue input that is not scored \[s\].
-const RUN_IN_S: f64 = 0.5;
 
 /// One record, ready.
 #[derive(Debug, Clone)]
@@ -161,38 +159,6 @@ impl Prepared {
     }
 }
 
-/// Free motions of a record. With an unknown working point: the motion of a wrong zero flow. For a plant that did not rest before
-/// the record: the decays of its poles.
-fn transients(base: &Base, flow: &FlowPaths, rows: usize) -> Vec<Vec<f64>> {
-    let mut all = Vec::new();
-    if base.free_working_point {
-        all.push(flow.off.clone());
-    }
-    if !base.free_start {
-        return all;
-    }
-    let (dt, length_s) = (base.sample_s, rows as f64 * base.sample_s);
-    for p in &base.zpk.poles {
-        // Slower is a level, faster is over at once.
-        if p.im < 0.0 || p.norm() * length_s < 0.05 || -p.re * dt > 5.0 {
-            continue;
-        }
-        let decay = |f: fn(f64) -> f64| -> Vec<f64> {
-            (0..rows)
-                .map(|k| {
-                    let t = k as f64 * dt;
-                    (p.re * t).exp() * f(p.im * t)
-                })
-                .collect()
-        };
-        all.push(decay(f64::cos));
-        if p.im > 0.0 {
-            all.push(decay(f64::sin));
-        }
-    }
-    all
-}
-
 /// A model, and others that are a small step of its stated error off, each with its effects.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Errors(pub(crate) Vec<(Base, Vec<Effect>)>);
@@ -281,13 +247,8 @@ impl Problem {
             .zip(repeated)
             .zip(waits(records, base.frame_age_s))
             .map(|((r, repeated), waits)| {
-                // How a sampled analogue input came from where it was before the record to its first sample is not known.
-                let run_in = if base.interpolated_input {
-                    ((RUN_IN_S / base.sample_s) as usize).min(r.rows() / 10)
-                } else {
-                    0
-                };
                 let u = r.displacement_um(base.working_point_um);
+                let run_in = run_in(&base, &u, &noise);
                 let present: Vec<bool> = r
                     .bead_um
                     .iter()

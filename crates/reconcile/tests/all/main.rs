@@ -2,6 +2,7 @@
 
 mod closed_loop;
 mod closed_loop_table;
+mod cut;
 mod labelled;
 mod measured;
 mod measured_piezo;
