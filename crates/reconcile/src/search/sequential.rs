@@ -310,13 +310,13 @@ fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
     count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
 
-/// The best single effect and its two rivals; `None` if nothing is worth a name.
+/// The best single effect and the others that were followed; `None` if nothing is worth a name.
 fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
     let mut singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
     singles.retain(|f| worth_it(ctx, null, f, null.chi2));
     let mut singles = singles.into_iter();
     let best = singles.next()?;
-    Some((best, singles.take(2).collect()))
+    Some((best, singles.collect()))
 }
 
 /// The best set with one more effect than a set; `None` if none is worth it. `least` is the least gain that it must promise, `forms` the
@@ -330,7 +330,7 @@ fn larger(
     let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
     next.retain(|f| worth_it(ctx, fit, f, forms));
     let top_chi2 = next.first()?.chi2;
-    // Something is left: the first choice may have been a compromise between two. Extend its rivals as well.
+    // Something is left: the first choice may have been a compromise between two that look poor alone. Extend the others as well.
     for other in std::mem::take(beam) {
         let least = 0.5 * (other.chi2 - top_chi2);
         let limits = [least, f64::INFINITY];
