@@ -7,11 +7,12 @@ use crate::simulate::Base;
 /// Start of a record that begins in motion, which is not scored \[s\].
 const RUN_IN_S: f64 = 0.5;
 
-/// Whether the command before a record shows in it, which nobody knows. A simulation begins at rest, so that lags, resonances and a delay
-/// would answer a step that was none.
+/// Whether the command before a record, which nobody knows, shows in the record. A simulation begins at rest and jumps to the first command:
+/// lags, resonances and a delay would answer a step that never came.
 ///
-/// How a sampled analogue input came to its first sample is never known. A held one shows if it moves the bead in a row by a third of the
-/// noise: a delay may be of three rows. Where the plant's own start is free, it takes up what came before.
+/// How a sampled analogue input came to its first sample is never known. The command before a held input shows if the first command moves
+/// the bead in a row by more than a third of the noise, because a delay may be three rows long. Where the start of the plant is free, it
+/// explains what came before.
 fn begins_in_motion(base: &Base, u: &[f64], noise: &NoiseModel) -> bool {
     let first_um = u.first().copied().unwrap_or(0.0);
     let moved_um = base.speed_per_um() * base.sample_s * first_um.abs();

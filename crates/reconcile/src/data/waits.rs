@@ -21,16 +21,17 @@ pub(crate) fn waits(records: &[Record], stated_s: Option<f64>) -> Vec<Waits> {
     let mut sorted: Vec<f64> = ages.iter().flatten().copied().collect();
     sorted.sort_by(f64::total_cmp);
     let youngest_s = sorted.get((YOUNGEST * sorted.len() as f64) as usize);
-    let Some(from_s) = stated_s.or(youngest_s.copied()) else {
-        return vec![Waits::default(); records.len()];
-    };
+    // Without any age there is nothing to count from, and no wait.
+    let from_s = stated_s.or(youngest_s.copied()).unwrap_or(0.0);
     let of = |(ages, r): (&Vec<f64>, &Record)| {
         let step_s = LEAST * r.sample_s;
-        let waited = ages.iter().any(|age| (age - from_s).abs() >= step_s);
+        if ages.iter().all(|age| (age - from_s).abs() < step_s) {
+            return Waits::default();
+        }
         let steps = |age: &f64| ((age - from_s) / step_s).round() as i16;
         Waits {
             step_s,
-            of_row: ages.iter().filter(|_| waited).map(steps).collect(),
+            of_row: ages.iter().map(steps).collect(),
         }
     };
     ages.iter().zip(records).map(of).collect()

@@ -23,17 +23,20 @@ pub(crate) struct Sampling {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Waits {
     pub step_s: f64,
-    /// Steps of each row; empty: no frame waited.
+    /// Steps of each row, 327 rows of time at most; empty: no frame waited.
     pub of_row: Vec<i16>,
 }
 
 impl Waits {
+    #[inline]
+    fn steps(&self, row: usize) -> i16 {
+        self.of_row.get(row).copied().unwrap_or(0)
+    }
+
     /// Wait of a row \[s\].
     #[inline]
     pub(crate) fn of_row_s(&self, row: usize) -> f64 {
-        self.of_row
-            .get(row)
-            .map_or(0.0, |steps| f64::from(*steps) * self.step_s)
+        f64::from(self.steps(row)) * self.step_s
     }
 }
 
@@ -94,11 +97,7 @@ pub(crate) fn sample(
     let known = sampling.exposure_s;
     let path = Path { t, h };
     let sample_s = h * fine as f64;
-    // A frame that close behind an edge shows the share of the edge, as one that close in front of it does. Otherwise a delay of
-    // whole frames would be a cliff, and a fit on top of it takes no step.
-    let whole = near_whole(delay / sample_s).filter(|_| sampling.is_plain());
-    let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
-    // A held command bends the path within an exposure, so points of it would not do for its mean.
+    // A held command bends the path within an exposure. Its mean is therefore integrated, not taken from single points.
     let window = match (known > 0.0, exposure > 0.0) {
         (true, false) => Some((-0.5 * known, 0.5 * known)),
         (false, true) => Some((-exposure, 0.0)),
@@ -114,6 +113,10 @@ pub(crate) fn sample(
         }
         return;
     }
+    // A frame close behind an edge shows the share of the edge, as a frame equally close in front of it does. Otherwise the sum of
+    // squares would have a cliff at a delay of whole frames, and a fit that starts there would take no step.
+    let whole = near_whole(delay / sample_s).filter(|_| sampling.is_plain());
+    let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
     y.extend((0..rows).map(|k| {
         let at = at(k);
         if known > 0.0 {
@@ -144,8 +147,8 @@ struct Path<'a> {
     h: f64,
 }
 
-/// Integral of a cubic over a part of its step (in steps), as weights of its start, its rise, and its slopes at start and end times the
-/// step.
+/// Integral of a cubic over a part of its step, in steps. These are the weights of [`Path::step`]: start, rise, and the slopes at both
+/// ends times the step.
 #[inline]
 fn area(part: f64) -> [f64; 4] {
     const THIRD: f64 = 1.0 / 3.0;
@@ -222,12 +225,8 @@ impl Path<'_> {
         y: &mut Vec<f64>,
     ) {
         let row_s = self.h * fine as f64;
-        let steps_of = |row: usize| waits.of_row.get(row).copied().unwrap_or(0);
-        let (least, most) = (0..rows)
-            .map(steps_of)
-            .fold((i16::MAX, 0), |(least, most), steps| {
-                (least.min(steps), most.max(steps))
-            });
+        let least = waits.of_row.iter().copied().min().unwrap_or(0);
+        let most = waits.of_row.iter().copied().max().unwrap_or(0);
         // Where a window lies depends on its row's wait alone: each is laid out once, at a row that has it all behind it.
         let reach_s = f64::from(most) * waits.step_s - from;
         let at = (reach_s / row_s).ceil().max(0.0) as usize + 1;
@@ -239,7 +238,7 @@ impl Path<'_> {
             let Some(later) = k.checked_sub(at).filter(|_| at < rows) else {
                 return alone();
             };
-            let of_wait = &mut laid_out[usize::from(steps_of(k).abs_diff(least))];
+            let of_wait = &mut laid_out[usize::from(waits.steps(k).abs_diff(least))];
             let window = of_wait.get_or_insert_with(|| {
                 let mid = at as f64 * row_s - waits.of_row_s(k);
                 Window::new(self.step_of(mid + from), self.step_of(mid + to))

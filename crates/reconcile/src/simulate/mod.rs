@@ -122,8 +122,8 @@ const MOST_STEPS: f64 = 20.0;
 
 /// Steps of a sample whose means go through a bend, behind a pole (in 1/sample).
 ///
-/// The mean of what bends differs from the bend of the mean by a 24th of the change in a step squared, times the curvature: at a
-/// tenth of what changes, by less than a part in a thousand of it.
+/// A bend is given the mean of its input over a step. Its own mean then lacks the curvature times a 24th of the squared change in the
+/// step. Where the input changes by a tenth of itself, that is less than a thousandth.
 fn steps_before_a_bend(pole: f64) -> usize {
     let enough = |steps: &usize| pole <= 0.1 * *steps as f64;
     [1, 4].into_iter().find(enough).unwrap_or(10)

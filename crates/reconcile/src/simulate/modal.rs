@@ -275,13 +275,12 @@ impl Modal {
         let before = std::iter::once(&0.0).chain(u);
         let jumps = u.iter().zip(before).map(|(u, before)| u - before);
         t.jump.extend(jumps.map(|step| self.direct * step));
-        match fine {
+        let last = match fine {
             4 => self.held::<4, 8>(u, t),
             10 => self.held::<10, 20>(u, t),
             _ => self.steps(u, t),
-        }
+        };
         // The slope at the end of a step is that at the start of the next, without the immediate effect of the next input.
-        let last = t.end_slope.pop().unwrap_or(0.0);
         let next = t.start_slope.iter().zip(u).skip(1).zip(u);
         let change =
             |((slope, after), u): ((&f64, &f64), &f64)| slope + self.slope_direct * (u - after);
@@ -294,8 +293,9 @@ impl Modal {
         }
     }
 
-    /// Position and slopes of the real modes and of the direct path, `FINE` steps at once; `BOTH` is twice that.
-    fn held<const FINE: usize, const BOTH: usize>(&self, u: &[f64], t: &mut Trace) {
+    /// Position and slopes of the real modes and of the direct path, `FINE` steps at once; `BOTH` is twice that. Returns the slope that the
+    /// real modes give at the end.
+    fn held<const FINE: usize, const BOTH: usize>(&self, u: &[f64], t: &mut Trace) -> f64 {
         // What a state at the start of a sample, and an input of 1 over it, give at each of its steps: position, then slope.
         let mut of_state = vec![[[0.0; BOTH]; 4]; self.real.len()];
         let mut of_input = [0.0; BOTH];
@@ -341,34 +341,39 @@ impl Modal {
                 continue;
             }
             for &u in piece {
-                let (mut y, mut v) = ([0.0; 4], [0.0; 4]);
-                for (four, z) in self.real.iter().zip(&mut states) {
-                    four.step(z, u, &mut y, &mut v);
-                }
-                t.pos.push(self.direct * before + sum(y));
-                t.start_slope.push(self.slope_direct * u + sum(v));
+                let (pos, slope) = self.step(&mut states, u, before);
+                t.pos.push(pos);
+                t.start_slope.push(slope);
                 before = u;
             }
         }
-        t.end_slope.push(self.slope_of(&states));
+        self.slope_of(&states)
     }
 
     /// The same, one step at a time.
-    fn steps(&self, u: &[f64], t: &mut Trace) {
+    fn steps(&self, u: &[f64], t: &mut Trace) -> f64 {
         let mut states = vec![[0.0; 4]; self.real.len()];
         let mut before = 0.0;
         t.pos.resize(u.len(), 0.0);
         t.start_slope.resize(u.len(), 0.0);
         for ((&u, pos), slope) in u.iter().zip(&mut t.pos).zip(&mut t.start_slope) {
-            let (mut y, mut v) = ([0.0; 4], [0.0; 4]);
-            for (four, z) in self.real.iter().zip(&mut states) {
-                four.step(z, u, &mut y, &mut v);
-            }
-            *pos = self.direct * before + sum(y);
-            *slope = self.slope_direct * u + sum(v);
+            (*pos, *slope) = self.step(&mut states, u, before);
             before = u;
         }
-        t.end_slope.push(self.slope_of(&states));
+        self.slope_of(&states)
+    }
+
+    /// Position and slope of the real modes and of the direct path at the start of a step, and the states on to the next.
+    #[inline(always)]
+    fn step(&self, states: &mut [[f64; 4]], u: f64, before: f64) -> (f64, f64) {
+        let (mut y, mut v) = ([0.0; 4], [0.0; 4]);
+        for (four, z) in self.real.iter().zip(states) {
+            four.step(z, u, &mut y, &mut v);
+        }
+        (
+            self.direct * before + sum(y),
+            self.slope_direct * u + sum(v),
+        )
     }
 
     /// Slope that the real modes give.
