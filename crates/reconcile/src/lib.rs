@@ -48,7 +48,7 @@ mod verdict;
 
 pub use data::actuator::constant_gain;
 pub use data::coloured::NoiseKind;
-pub use data::floor::FloorSource;
+pub use data::estimate::FloorSource;
 pub use data::flow_loss::FlowLoss;
 pub use data::motion::ZeroFlow;
 pub use data::noise::{Coloured, NoiseModel};

@@ -1,5 +1,6 @@
 //! Records made ready for fitting: commands from the working point, whitening filters, masks.
 
+use crate::data::feedback::answers_frames;
 use crate::data::flow_estimate;
 use crate::data::flow_loss::FlowLoss;
 use crate::data::free::Free;
@@ -242,6 +243,9 @@ impl Problem {
         let velocity = base.zpk.at(nalgebra::Complex::new(0.0, 125.0)).norm() * 125.0;
         let kick = if base.interpolated_input { 0.0 } else { direct };
         let range_um = command_range_um(records);
+        // With a positive gain the bead follows the command at once, or a right angle behind it.
+        let follows = base.zpk.at(nalgebra::Complex::new(0.0, 125.0));
+        let rises = follows.re >= follows.im;
         let prepared = records
             .iter()
             .zip(repeated)
@@ -272,6 +276,7 @@ impl Problem {
                 let sampling = Sampling {
                     exposure_s: r.exposure_s,
                     waits,
+                    answered: answers_frames(&u, &r.bead_um, &present, rises),
                 };
                 let mut prepared = Prepared {
                     model_errors: errors.responses(&u, &sampling, &[]),

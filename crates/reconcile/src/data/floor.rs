@@ -1,54 +1,17 @@
 //! The noise floor, from the records or from what is stated, before any model is believed; or the statement that it is not
 //! known.
 
-use crate::data::cleaned::{increment_moments, without_jumps, without_lines};
-use crate::data::coloured::{Alone, NoiseKind, choose};
-use crate::data::no_response::{holds, without_response};
+use crate::data::coloured::{NoiseKind, choose};
+use crate::data::estimate::{
+    Differences, Estimate, FloorSource, independent, of, of_increments, pooled,
+};
+use crate::data::no_response::holds;
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
 use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
 use crate::data::zero_flow::descend;
 use crate::thresholds::THRESHOLDS;
-use serde::Serialize;
 use std::ops::Range;
-
-/// Where the noise floor comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum FloorSource {
-    /// Records whose command rests.
-    Rest,
-    /// Differences of successive periods of a command that repeats.
-    Periods,
-    /// Differences of records with the same command.
-    EqualRecords,
-    /// The noise that the model states.
-    Stated,
-    /// Nowhere: nothing rests or repeats, and nothing is stated. The figures are then the fit's own residual.
-    Unknown,
-}
-
-impl FloorSource {
-    /// In words, for results.
-    pub fn words(self) -> &'static str {
-        match self {
-            Self::Rest => "measured at rest",
-            Self::Periods => "measured between periods of the command",
-            Self::EqualRecords => "measured between records of the same command",
-            Self::Stated => {
-                "stated in the model: no record has a rest of the command or repeats it for long enough"
-            }
-            Self::Unknown => {
-                "not known: no rest of the command, no repeated command, no stated noise"
-            }
-        }
-    }
-
-    /// Whether there is a floor at all.
-    pub fn is_known(self) -> bool {
-        self != Self::Unknown
-    }
-}
 
 /// The noise floor of a set of records.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,58 +20,6 @@ pub(crate) struct Floor {
     pub source: FloorSource,
     /// Increments that it was measured from; 0 where it was not.
     pub rows: usize,
-}
-
-/// Variance and lag-1 covariance of increments, how many, and where from.
-#[derive(Debug, Clone)]
-struct Estimate {
-    c0: f64,
-    c1: f64,
-    rows: usize,
-    /// The independent share of these.
-    independent: f64,
-    source: FloorSource,
-    /// The noise itself, lines and jumps off, and which rows count.
-    alone: (Vec<f64>, Vec<bool>),
-    share: f64,
-}
-
-impl Estimate {
-    fn alone(&self) -> Alone<'_> {
-        Alone {
-            values: &self.alone.0,
-            counts: &self.alone.1,
-            share: self.share,
-        }
-    }
-
-    /// Whether it has rows enough.
-    fn counts(&self) -> bool {
-        self.rows >= THRESHOLDS.floor_rows && self.c0 > 0.0
-    }
-
-    /// Independent increments.
-    fn independent(&self) -> usize {
-        (self.independent * self.rows as f64) as usize
-    }
-
-    fn sigma(&self) -> f64 {
-        NoiseModel::from_increments(self.c0, self.c1).innovation_um()
-    }
-
-    /// The upper limit of the standard deviation after this number of increments.
-    fn most(&self) -> f64 {
-        self.sigma() * (1.0 + error_of(self.independent()))
-    }
-}
-
-/// Relative error of a noise's standard deviation from this number of increments: three standard deviations, because one of
-/// several estimates is small by chance. A noise that was not measured is taken as stated.
-pub(crate) fn error_of(rows: usize) -> f64 {
-    match rows {
-        0 => 0.0,
-        rows => 3.0 / (2.0 * rows as f64).sqrt(),
-    }
 }
 
 /// Estimates both noises from residuals of the null model.
@@ -126,15 +37,15 @@ pub(crate) fn estimate(
     stated: Option<NoiseModel>,
     kind: NoiseKind,
 ) -> Floor {
-    let mut found = of_records(records, present, residuals);
     let quantum_um2 = quantisation_um2(records);
     let walks = kind == NoiseKind::Walk && quantum_um2 == 0.0;
+    let mut found = of_records(records, present, residuals, walks);
     // Steps of a sensor that counts are no Gaussian process: nothing is read from their correlation unasked.
     let unasked = kind == NoiseKind::Auto && quantum_um2 > 0.0;
     let kind = if unasked { NoiseKind::Walk } else { kind };
     // If no whole record shows the noise, parts of records may: a misfit can only add.
     if found.is_empty() {
-        found = of_parts(records, present, residuals);
+        found = of_parts(records, present, residuals, walks);
     }
     if found.is_empty() && walks {
         found = of_holds(records, present, residuals);
@@ -185,17 +96,14 @@ pub(crate) fn estimate(
     }
 }
 
-/// Independent squares in the sum over this number of successive differences, as a share of the number. Neighbours share a noise:
-/// their correlation is -1/2, that of their squares 1/4, and the sum of `m` squares scatters as that of `m^2/(m + (m - 1)/2)`
-/// independent ones.
-fn independent(differences: f64) -> f64 {
-    let m = differences.max(1.0);
-    m / (m + 0.5 * (m - 1.0))
-}
-
 /// The noise that whole records show. Each row counts once: by the rest or the periods of its record, else by the previous record
 /// with the same command.
-fn of_records(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
+fn of_records(
+    records: &[Record],
+    present: &[Vec<bool>],
+    residuals: &[Vec<f64>],
+    walks: bool,
+) -> Vec<Estimate> {
     let whole = crate::data::record::command_range_um(records);
     let mut found: Vec<Estimate> = Vec::new();
     let mut silent: Vec<usize> = Vec::new();
@@ -204,7 +112,7 @@ fn of_records(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>])
         let own = if r.rests_within(THRESHOLDS.rest_share * whole) {
             Some(of(e, ok, r.sample_s, FloorSource::Rest, 1.0))
         } else {
-            whole_periods(r).and_then(|repeats| between_periods(r, e, ok, &repeats))
+            whole_periods(r).and_then(|repeats| between_periods(r, e, ok, &repeats, walks))
         };
         match own.filter(Estimate::counts) {
             Some(own) => found.push(own),
@@ -217,13 +125,18 @@ fn of_records(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>])
             continue;
         };
         let differences = silent.iter().filter(equal).count() - 1;
-        let (a, b) = (&residuals[i], &residuals[j]);
-        let d: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
+        let apart =
+            |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a - b).collect() };
         let ok: Vec<bool> = (present[i].iter().zip(&present[j]))
             .map(|(a, b)| *a && *b)
             .collect();
-        let ok = &ok[..d.len()];
-        let mut equals = of(&d, ok, records[i].sample_s, FloorSource::EqualRecords, 0.5);
+        let of = apart(&residuals[i], &residuals[j]);
+        let told = Differences {
+            command_um: &apart(&records[i].pzt_um, &records[j].pzt_um),
+            ok: &ok[..of.len()],
+            of: &of,
+        };
+        let mut equals = told.noise(records[i].sample_s, FloorSource::EqualRecords, walks);
         equals.independent = independent(differences as f64);
         found.push(equals);
     }
@@ -232,12 +145,17 @@ fn of_records(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>])
 }
 
 /// What parts of records tell of the noise: stretches in which the command repeats itself, and its rests elsewhere.
-fn of_parts(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
+fn of_parts(
+    records: &[Record],
+    present: &[Vec<bool>],
+    residuals: &[Vec<f64>],
+    walks: bool,
+) -> Vec<Estimate> {
     let mut found: Vec<Estimate> = Vec::new();
     for (i, r) in records.iter().enumerate() {
         let (e, ok) = (&residuals[i], &present[i]);
         let repeated = repeats(r).and_then(|repeats| {
-            let own = between_periods(r, e, ok, &repeats).filter(Estimate::counts)?;
+            let own = between_periods(r, e, ok, &repeats, walks).filter(Estimate::counts)?;
             Some((repeats, own))
         });
         let told = |rows: &Range<usize>| {
@@ -256,32 +174,18 @@ fn of_parts(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -
     found
 }
 
-/// An estimate from residuals or differences that contain noise alone, `share` times that of one record.
-fn of(e: &[f64], ok: &[bool], sample_s: f64, source: FloorSource, share: f64) -> Estimate {
-    let (clean, fitted) = without_lines(e, ok, sample_s);
-    let counts = without_jumps(&clean, ok);
-    let (c0, c1, rows) = increment_moments(&clean, &counts);
-    // Numbers that were fitted, the mean among them, took their share of the squares.
-    let fitted = (1 + fitted).min(rows / 2) as f64;
-    let share = share * rows as f64 / (rows as f64 - fitted).max(1.0);
-    Estimate {
-        c0: share * c0,
-        c1: share * c1,
-        rows,
-        independent: 1.0,
-        source,
-        alone: (clean, counts),
-        share,
-    }
-}
-
 /// What the differences between rows and the rows a period before tell: of residuals or of positions, whichever is the smaller. The
 /// noise of a measured input goes through the model into the residuals, and not into the positions; they are the same rows.
-fn between_periods(r: &Record, e: &[f64], present: &[bool], repeats: &Repeats) -> Option<Estimate> {
+fn between_periods(
+    r: &Record,
+    e: &[f64],
+    present: &[bool],
+    repeats: &Repeats,
+    walks: bool,
+) -> Option<Estimate> {
     let p = repeats.rows;
-    let first = repeats.ranges.first().map_or(p, |range| range.start);
     let last = repeats.ranges.last().map_or(p, |range| range.end);
-    let rows = first..last;
+    let rows = p..last;
     let ok: Vec<bool> = rows
         .clone()
         .map(|k| {
@@ -290,12 +194,20 @@ fn between_periods(r: &Record, e: &[f64], present: &[bool], repeats: &Repeats) -
         })
         .collect();
     let periods = ok.iter().filter(|ok| **ok).count() as f64 / p as f64;
-    let told = |values: &[f64]| {
-        let d: Vec<f64> = (rows.clone())
+    let apart = |values: &[f64]| -> Vec<f64> {
+        (rows.clone())
             .map(|k| values[k] - values[k - p])
             .map(|d| if d.is_finite() { d } else { 0.0 })
-            .collect();
-        let mut own = of(&d, &ok, r.sample_s, FloorSource::Periods, 0.5);
+            .collect()
+    };
+    let command = apart(&r.pzt_um);
+    let told = |values: &[f64]| {
+        let told = Differences {
+            command_um: &command,
+            of: &apart(values),
+            ok: &ok,
+        };
+        let mut own = told.noise(r.sample_s, FloorSource::Periods, walks);
         own.independent = independent(periods);
         own
     };
@@ -305,71 +217,22 @@ fn between_periods(r: &Record, e: &[f64], present: &[bool], repeats: &Repeats) -
         .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
 }
 
-/// The increments of residuals as they are.
-fn of_increments(e: &[f64], present: &[bool]) -> Estimate {
-    let (c0, c1, rows) = increment_moments(e, present);
-    Estimate {
-        c0,
-        c1,
-        rows,
-        independent: 1.0,
-        source: FloorSource::Unknown,
-        alone: (e.to_vec(), present.to_vec()),
-        share: 1.0,
-    }
-}
-
 /// Holds of a bead in closed loop: stretches in which the command moves the bead by less than the noise does. What follows the command
 /// linearly is taken off.
 fn of_holds(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
-    /// Rounds in which noise and response settle: each leaves a part of the last one's error that is as small as the response's share.
-    const ROUNDS: usize = 3;
     let mut found: Vec<Estimate> = Vec::new();
     for ((r, e), ok) in records.iter().zip(residuals).zip(present) {
         for rows in holds(r, e, ok) {
             let (u, e, ok) = (&r.pzt_um[rows.clone()], &e[rows.clone()], &ok[rows]);
-            let mut own = of_increments(e, ok);
-            for _ in 0..ROUNDS {
-                let noise = NoiseModel::from_increments(own.c0, own.c1);
-                let Some((clean, fitted)) = without_response(u, e, ok, &noise) else {
-                    break;
-                };
-                let share = own.rows as f64 / (own.rows as f64 - fitted as f64).max(1.0);
-                own = of(&clean, ok, r.sample_s, FloorSource::Rest, share);
-            }
-            found.extend((own.source == FloorSource::Rest && own.counts()).then_some(own));
+            let raw = Estimate {
+                source: FloorSource::Rest,
+                ..of_increments(e, ok)
+            };
+            found.extend(raw.without_response((u, e, ok), r.sample_s, 1.0));
         }
     }
+    found.retain(Estimate::counts);
     found
-}
-
-/// Those that differ from the least by chance together.
-fn pooled(of: &[Estimate], least: &Estimate) -> Estimate {
-    let by_chance = |f: &&Estimate| {
-        let error = error_of(f.independent()).hypot(error_of(least.independent()));
-        (f.sigma() / least.sigma() - 1.0).abs() <= error
-    };
-    let near: Vec<&Estimate> = of.iter().filter(by_chance).collect();
-    let n: f64 = near
-        .iter()
-        .map(|f| f.independent() as f64)
-        .sum::<f64>()
-        .max(1.0);
-    let mean = |get: fn(&Estimate) -> f64| {
-        near.iter()
-            .map(|f| get(f) * f.independent() as f64)
-            .sum::<f64>()
-            / n
-    };
-    Estimate {
-        c0: mean(|f| f.c0),
-        c1: mean(|f| f.c1),
-        rows: n as usize,
-        independent: 1.0,
-        source: FloorSource::Unknown,
-        alone: Default::default(),
-        share: 1.0,
-    }
 }
 
 /// Variance that the finest step of the position column adds: a sensor that counts is never better than that.
@@ -384,9 +247,9 @@ fn quantisation_um2(records: &[Record]) -> f64 {
 /// A noise with the walk and the white noise of the greatest likelihood; `unlikelihood` is twice the negative log-likelihood of a
 /// fit's residual. Increments alone would take a zero flow that drifts for a walk.
 pub(crate) fn refined(noise: &NoiseModel, unlikelihood: impl Fn(&NoiseModel) -> f64) -> NoiseModel {
-    // Shares of the increments' variance that white noise may have, as [`NoiseModel::from_increments`] has them.
-    const LEAST: f64 = -0.25;
-    const RANGE: f64 = 0.7495;
+    // Shares of the increments' variance that white noise may have.
+    const LEAST: f64 = -NoiseModel::MOST_CORRELATION;
+    const RANGE: f64 = -NoiseModel::LEAST_CORRELATION - LEAST;
     let of = |[size, share]: [f64; 2]| {
         let variance = size.exp();
         let white = variance * (LEAST + RANGE / (1.0 + (-share).exp()));

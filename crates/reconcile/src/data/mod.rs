@@ -3,6 +3,8 @@
 pub(crate) mod actuator;
 mod cleaned;
 pub(crate) mod coloured;
+pub(crate) mod estimate;
+pub(crate) mod feedback;
 pub(crate) mod floor;
 pub(crate) mod flow_estimate;
 pub(crate) mod flow_loss;

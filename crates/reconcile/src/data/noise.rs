@@ -50,12 +50,17 @@ impl NoiseModel {
         }
     }
 
+    /// Correlation of successive increments if next to all of them is white noise.
+    pub(crate) const LEAST_CORRELATION: f64 = -0.4995;
+    /// The same of a walk that is averaged over the whole row: `q/6` of `q - 2 q/6`.
+    pub(crate) const MOST_CORRELATION: f64 = 0.25;
+
     /// From variance and lag-1 covariance of increments, `q + 2 R` and `-R`, kept physical: a camera that averages over its
     /// exposure lowers the white part by up to `q / 6`, for an exposure of a whole row.
     pub fn from_increments(variance: f64, lag1: f64) -> Self {
         let variance = variance.max(1e-40);
-        // q/6 of q - 2 q/6.
-        let white = (-lag1).clamp(-0.25 * variance, 0.4995 * variance);
+        let correlation = (lag1 / variance).clamp(Self::LEAST_CORRELATION, Self::MOST_CORRELATION);
+        let white = -correlation * variance;
         Self {
             walk_um2: variance - 2.0 * white,
             white_um2: white,

@@ -4,6 +4,7 @@ pub(crate) mod cost;
 pub(crate) mod effort;
 pub(crate) mod found;
 pub(crate) mod lines;
+mod pairs;
 mod pixel;
 mod screen;
 pub(crate) mod sequential;

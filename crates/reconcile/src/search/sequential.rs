@@ -5,10 +5,12 @@ use crate::fit::context::{Context, Fit};
 use crate::fit::descent::Until;
 use crate::mask::Mask;
 use crate::search::cost::{
-    before_forms, gap, least_gain, leaves_much, left_over, penalised_cost, threshold_of,
+    before_forms, gap, least_gain, leaves_much, left_over, penalised_cost, surely_left,
+    threshold_of,
 };
 use crate::search::effort::Effort;
 use crate::search::found::{Found, Rival};
+use crate::search::pairs::pair_in_place_of;
 use crate::search::screen::screen;
 use crate::thresholds::THRESHOLDS;
 
@@ -310,13 +312,13 @@ fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
     count > 1 && open > (1.0 - THRESHOLDS.closed_least) * whole
 }
 
-/// The best single effect and the others that were followed; `None` if nothing is worth a name.
-fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(Fit, Vec<Fit>)> {
-    let mut singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
-    singles.retain(|f| worth_it(ctx, null, f, null.chi2));
-    let mut singles = singles.into_iter();
-    let best = singles.next()?;
-    Some((best, singles.collect()))
+/// The best single effect; `None` if nothing is worth a name.
+fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<Fit> {
+    let singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
+    let mut worth = singles
+        .into_iter()
+        .filter(|f| worth_it(ctx, null, f, null.chi2));
+    worth.next()
 }
 
 /// The best set with one more effect than a set; `None` if none is worth it. `least` is the least gain that it must promise, `forms` the
@@ -324,20 +326,11 @@ fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<(
 fn larger(
     (ctx, mask, effort): (&Context<'_>, &Mask, Effort),
     fit: &Fit,
-    beam: &mut Vec<Fit>,
     (least, forms): (f64, f64),
 ) -> Option<Fit> {
     let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
     next.retain(|f| worth_it(ctx, fit, f, forms));
-    let top_chi2 = next.first()?.chi2;
-    // Something is left: the first choice may have been a compromise between two that look poor alone. Extend the others as well.
-    for other in std::mem::take(beam) {
-        let least = 0.5 * (other.chi2 - top_chi2);
-        let limits = [least, f64::INFINITY];
-        next.extend(extensions(ctx, &other, mask, effort, 4, &[], limits));
-    }
-    let cost = |f: &Fit| penalised_cost(ctx, f);
-    next.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b)))
+    next.into_iter().next()
 }
 
 /// The model alone.
@@ -360,14 +353,14 @@ pub(crate) fn search(
     let begun = match start.filter(|f| !f.parts.is_empty()) {
         Some(start) => {
             let again = ctx.fit_from(start.parts.clone(), Some(start.soft), mask, 12);
-            Some((eliminate(ctx, again, &null, mask, effort), Vec::new()))
+            Some(eliminate(ctx, again, &null, mask, effort))
         }
         None => {
             progress("screening single effects");
             first(ctx, &null, mask, effort)
         }
     };
-    let Some((mut fit, mut beam)) = begun else {
+    let Some(mut fit) = begun else {
         return Found {
             fit: null.clone(),
             null,
@@ -399,7 +392,17 @@ pub(crate) fn search(
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
         let forms = before_forms(ctx, &null, &fit, mask);
         let least = least_gain(ctx, 1, forms - fit.chi2);
-        let Some(top) = larger((ctx, mask, effort), &fit, &mut beam, (least, forms)) else {
+        let how = (ctx, mask, effort);
+        let mut top = larger(how, &fit, (least, forms));
+        // A first choice that leaves something may have been a compromise.
+        if fit.parts.len() == 1
+            && start.is_none()
+            && (top.is_some() || surely_left(ctx, &fit) > 0.0)
+        {
+            let beaten = top.as_ref().unwrap_or(&fit);
+            top = pair_in_place_of(how, &null, &fit, beaten).or(top);
+        }
+        let Some(top) = top else {
             break;
         };
         let top = eliminate(ctx, top, &null, mask, effort);

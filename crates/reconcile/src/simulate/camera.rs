@@ -17,6 +17,8 @@ pub(crate) struct Sampling {
     /// Exposure about the middle of each frame, if it is known \[s\].
     pub exposure_s: f64,
     pub waits: Waits,
+    /// The command of a row answers its frame: a clock that runs ahead takes no frame after it.
+    pub answered: bool,
 }
 
 /// How much older each frame is at its command than the frames that did not wait for it, in steps of the stamps' jitter.
@@ -103,7 +105,14 @@ pub(crate) fn sample(
         (false, true) => Some((-exposure, 0.0)),
         _ => None,
     };
-    let at = |k: usize| k as f64 * sample_s * (1.0 + skew) - delay - sampling.waits.of_row_s(k);
+    let at = |k: usize| {
+        let row_s = k as f64 * sample_s;
+        let at_s = row_s * (1.0 + skew) - delay - sampling.waits.of_row_s(k);
+        match sampling.answered {
+            true => at_s.min(row_s),
+            false => at_s,
+        }
+    };
     if let Some((from, to)) = window {
         if skew == 0.0 {
             let window = (from - delay, to - delay);
@@ -308,7 +317,7 @@ mod tests {
         };
         let sampling = Sampling {
             exposure_s: 0.5,
-            waits: Waits::default(),
+            ..Sampling::default()
         };
         let mut y = Vec::new();
         let mut at_bend = |frames: Frames| {
@@ -323,6 +332,34 @@ mod tests {
             ..Frames::default()
         });
         assert!((averaged - 0.125).abs() < 2e-3, "{averaged}");
+    }
+
+    #[test]
+    fn a_frame_that_its_command_answers_was_taken_before_it() {
+        let rows = 8;
+        let slope = vec![1.0; rows];
+        let path = Trace {
+            pos: (0..rows).map(|k| k as f64).collect(),
+            jump: vec![0.0; rows],
+            start_slope: slope.clone(),
+            end_slope: slope,
+        };
+        let ahead = Frames {
+            skew: 0.1,
+            delay_s: 0.25,
+            exposure_s: 0.0,
+        };
+        let mut y = Vec::new();
+        for (answered, expected) in [(false, 5.25), (true, 5.0)] {
+            let sampling = Sampling {
+                answered,
+                ..Sampling::default()
+            };
+            sample(&path, (ahead, &sampling), 1.0, 1, rows, &mut y);
+            // Behind its row only once the clock has made up for the delay.
+            assert!((y[2] - 1.95).abs() < 1e-9, "{y:?}");
+            assert!((y[5] - expected).abs() < 1e-9, "{y:?}");
+        }
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
 use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
 use crate::search::found::Rival;
-use crate::thresholds::THRESHOLDS;
+use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::verdict::form::WithoutMemory;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};
 use crate::verdict::profile;
@@ -74,6 +74,9 @@ fn alternatives(
         };
         let records = ctx.problem.records.len();
         let price = price + price_of_waves(&r.part, records) - price_of_waves(part, records);
+        // The winner has to be worth each number that it has more.
+        let spared = part.theta.len().saturating_sub(r.part.theta.len());
+        let price = price - NUMBER * spared as f64;
         let ties = r.chi2 + price - fit.chi2 < THRESHOLDS.tie && !decided;
         if ties && !(richer && ends_as_well(ctx, fit, index, r)) {
             open |= !inseparable(id, r.id);

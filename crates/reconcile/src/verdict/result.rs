@@ -1,6 +1,6 @@
 //! The result of the workflow: verdict, effects, places, gap, and the data of a report.
 
-use crate::data::floor::FloorSource;
+use crate::data::estimate::FloorSource;
 use crate::data::noise::NoiseModel;
 use crate::fit::context::{Context, Fit};
 use crate::problem::Prepared;

@@ -1,7 +1,8 @@
 //! The search under noise that depends on its results: a floor that a better fit lowers, a zero flow that moves.
 
 use crate::data::coloured::NoiseKind;
-use crate::data::floor::{Floor, error_of, refined};
+use crate::data::estimate::error_of;
+use crate::data::floor::{Floor, refined};
 use crate::data::flow_loss::FlowLoss;
 use crate::data::noise::NoiseModel;
 use crate::fit::catalogue::{self, Part};
@@ -16,7 +17,7 @@ use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
 use crate::verdict::late_frames::LateFrames;
 use crate::verdict::wandering::{Wandering, prior_of, suspected};
-use cellpos_plant::effects::{Action, Place, Scope};
+use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
 /// In twice the log-likelihood: another estimate of the zero flow changes nothing that decides.
@@ -369,24 +370,20 @@ impl Searching<'_> {
         best
     }
 
-    /// Weighs a set without each of its parts, each under the noise that it leaves itself, if the flow does not pass the chip linearly. There
-    /// a zero flow in the noise is no zero flow, and a part may stand for the path of one. The best set that is more probable.
+    /// Weighs a set without each of its small parts, each under the noise that it leaves itself: a part may stand for the path of a zero
+    /// flow. The best set that is more probable.
     fn weigh_smaller(&self, own: &Weighed) -> Option<Weighed> {
-        let bends = |e: &Effect| {
-            let in_chip = matches!(e.kind().spec().place, Place::Chip | Place::Bead);
-            in_chip && matches!(e.act(), Action::Block(_))
-        };
         let count = own.fit.parts.len();
-        if count < 2 || !self.effects(&own.fit).iter().any(bends) {
+        if count < 2 {
             return None;
         }
         let ctx = self.context(&own.problem, 0);
         let all = own.problem.all();
-        let without = (0..count).map(|i| {
-            let fit = ctx.fit_without(&own.fit, i, &all, 8);
-            self.with_zero_flow(&own.problem, &fit, own.cost)
-        });
-        without
+        let most = own.fit.chi2 + within(&own.fit);
+        let without = (0..count).map(|i| ctx.fit_without(&own.fit, i, &all, 8));
+        let weighed = (without.filter(|fit| fit.chi2 < most))
+            .map(|fit| self.with_zero_flow(&own.problem, &fit, own.cost));
+        weighed
             .min_by(|a, b| a.cost.total_cmp(&b.cost))
             .filter(|best| best.cost < own.cost)
     }

@@ -3,6 +3,7 @@
 use crate::fit::context::{Context, Fit};
 use crate::mask::Mask;
 use crate::search::cost::threshold;
+use crate::search::cost::threshold_of;
 use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;
 use crate::verdict::parameters::{numeric_error, told};
@@ -98,6 +99,25 @@ pub(crate) fn birge(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Vec<f64> {
         at += part.theta.len();
     }
     ratios
+}
+
+/// The part that is least beyond chance, if it is not beyond it at all: where its size scatters between parts of the records by more than
+/// the noise, an addition must gain as much more.
+pub(crate) fn scattered(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Option<usize> {
+    let ratios = birge(ctx, fit, threads);
+    let (all, records) = (ctx.problem.all(), ctx.problem.records.len());
+    let short_of = |i: usize| {
+        let ratio = ratios[fit.numbers_before(i)];
+        // The search has seen to a part that does not scatter.
+        let gain = match ratio > 1.0 {
+            true => ctx.fit_without(fit, i, &all, 8).chi2 - fit.chi2,
+            false => f64::INFINITY,
+        };
+        gain / (ratio * ratio) / threshold_of(fit.parts[i].variant(), records)
+    };
+    let worst = (0..fit.parts.len()).map(|i| (i, short_of(i)));
+    let (i, share) = worst.min_by(|a, b| a.1.total_cmp(&b.1))?;
+    (share < 1.0).then_some(i)
 }
 
 /// A number that is not the same in all parts of the records.

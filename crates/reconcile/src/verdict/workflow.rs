@@ -1,7 +1,8 @@
 //! The workflow: guards, null model, search, held-out check.
 
 use crate::data::coloured::NoiseKind;
-use crate::data::floor::{self, FloorSource};
+use crate::data::estimate::FloorSource;
+use crate::data::floor;
 use crate::data::frames;
 use crate::data::motion::ZeroFlow;
 use crate::data::noise::NoiseModel;
@@ -27,6 +28,7 @@ use crate::verdict::judge;
 use crate::verdict::result::Reconciliation;
 use crate::verdict::searching::{Searched, Searching};
 use crate::verdict::small;
+use crate::verdict::split;
 use cellpos_plant::Model;
 use cellpos_plant::effects::Scope;
 
@@ -230,19 +232,25 @@ fn confirmed(
     threads: usize,
     progress: &mut dyn FnMut(&str),
 ) -> HeldOut {
-    let mut held = held_out::check(ctx, &found.fit, threads);
-    while let Some(i) = held.unconfirmed.first().copied() {
-        progress(&format!(
-            "{} does not hold on held-out data: taken back",
-            ids(&found.fit)[i]
-        ));
+    loop {
+        let held = held_out::check(ctx, &found.fit, threads);
+        let unconfirmed = held.unconfirmed.first().copied();
+        let unconfirmed = unconfirmed.map(|i| (i, "does not hold on held-out data"));
+        let scattered = || split::scattered(ctx, &found.fit, threads);
+        let Some((i, why)) = unconfirmed.or_else(|| {
+            Some((
+                scattered()?,
+                "differs too much between parts of the records",
+            ))
+        }) else {
+            return held;
+        };
+        progress(&format!("{} {why}: taken back", ids(&found.fit)[i]));
         let mut parts = found.fit.parts.clone();
         parts.remove(i);
         let without = ctx.fit(parts, &ctx.problem.all(), 12);
         found.lose(ctx, i, without, threads);
-        held = held_out::check(ctx, &found.fit, threads);
     }
-    held
 }
 
 /// The problem with a zero flow as large as the commands, of a plant that integrates: slow motion then says nothing of the response.
