@@ -151,6 +151,7 @@ pub(crate) fn pair_in_place_of(
     fit: &Fit,
     top: &Fit,
 ) -> Option<Fit> {
+    /// As many as a screening follows, and a half of them to the end.
     const MOST: usize = 8;
     let leads = pairs(ctx, null, mask, effort.threads, |v| {
         !v.candidate().late && !v.is_own() && !ctx.excludes(v.id()) && !fit.has(v.id())

@@ -17,7 +17,7 @@ use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
 use crate::verdict::late_frames::LateFrames;
 use crate::verdict::wandering::{Wandering, prior_of, suspected};
-use cellpos_plant::effects::Scope;
+use cellpos_plant::effects::{Action, Place, Scope};
 use cellpos_plant::{Effect, Model};
 
 /// In twice the log-likelihood: another estimate of the zero flow changes nothing that decides.
@@ -370,18 +370,24 @@ impl Searching<'_> {
         best
     }
 
-    /// Weighs a set without each of its small parts, each under the noise that it leaves itself: a part may stand for the path of a zero
-    /// flow. The best set that is more probable.
+    /// Weighs a set without each of its parts, each under the noise that it leaves itself: a small part may stand for the path of a zero
+    /// flow. Any may where the flow does not pass the chip linearly, because there a zero flow in the noise is no zero flow. The best set
+    /// that is more probable.
     fn weigh_smaller(&self, own: &Weighed) -> Option<Weighed> {
+        let bends = |e: &Effect| {
+            let in_chip = matches!(e.kind().spec().place, Place::Chip | Place::Bead);
+            in_chip && matches!(e.act(), Action::Block(_))
+        };
         let count = own.fit.parts.len();
         if count < 2 {
             return None;
         }
+        let any = self.effects(&own.fit).iter().any(bends);
+        let most = own.fit.chi2 + within(&own.fit);
         let ctx = self.context(&own.problem, 0);
         let all = own.problem.all();
-        let most = own.fit.chi2 + within(&own.fit);
         let without = (0..count).map(|i| ctx.fit_without(&own.fit, i, &all, 8));
-        let weighed = (without.filter(|fit| fit.chi2 < most))
+        let weighed = (without.filter(|fit| any || fit.chi2 < most))
             .map(|fit| self.with_zero_flow(&own.problem, &fit, own.cost));
         weighed
             .min_by(|a, b| a.cost.total_cmp(&b.cost))

@@ -2,8 +2,7 @@
 
 use crate::fit::context::{Context, Fit};
 use crate::mask::Mask;
-use crate::search::cost::threshold;
-use crate::search::cost::threshold_of;
+use crate::search::cost::{threshold, threshold_of};
 use crate::thresholds::{CHANCE_SD, THRESHOLDS};
 use crate::units::figure;
 use crate::verdict::parameters::{numeric_error, told};
@@ -107,13 +106,13 @@ pub(crate) fn scattered(ctx: &Context<'_>, fit: &Fit, threads: usize) -> Option<
     let ratios = birge(ctx, fit, threads);
     let (all, records) = (ctx.problem.all(), ctx.problem.records.len());
     let short_of = |i: usize| {
-        let ratio = ratios[fit.numbers_before(i)];
+        let (ratio, variant) = (ratios[fit.numbers_before(i)], fit.parts[i].variant());
         // The search has seen to a part that does not scatter.
-        let gain = match ratio > 1.0 {
-            true => ctx.fit_without(fit, i, &all, 8).chi2 - fit.chi2,
-            false => f64::INFINITY,
-        };
-        gain / (ratio * ratio) / threshold_of(fit.parts[i].variant(), records)
+        if ratio <= 1.0 || variant.role != Role::Chain {
+            return f64::INFINITY;
+        }
+        let gain = ctx.fit_without(fit, i, &all, 8).chi2 - fit.chi2;
+        gain / (ratio * ratio) / threshold_of(variant, records)
     };
     let worst = (0..fit.parts.len()).map(|i| (i, short_of(i)));
     let (i, share) = worst.min_by(|a, b| a.1.total_cmp(&b.1))?;

@@ -232,17 +232,15 @@ fn confirmed(
     threads: usize,
     progress: &mut dyn FnMut(&str),
 ) -> HeldOut {
+    const SCATTERS: &str = "differs too much between parts of the records";
     loop {
         let held = held_out::check(ctx, &found.fit, threads);
-        let unconfirmed = held.unconfirmed.first().copied();
-        let unconfirmed = unconfirmed.map(|i| (i, "does not hold on held-out data"));
-        let scattered = || split::scattered(ctx, &found.fit, threads);
-        let Some((i, why)) = unconfirmed.or_else(|| {
-            Some((
-                scattered()?,
-                "differs too much between parts of the records",
-            ))
-        }) else {
+        let scattered = || Some((split::scattered(ctx, &found.fit, threads)?, SCATTERS));
+        let unconfirmed = held
+            .unconfirmed
+            .first()
+            .map(|i| (*i, "does not hold on held-out data"));
+        let Some((i, why)) = unconfirmed.or_else(scattered) else {
             return held;
         };
         progress(&format!("{} {why}: taken back", ids(&found.fit)[i]));
