@@ -321,16 +321,24 @@ fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<F
     worth.next()
 }
 
-/// The best set with one more effect than a set; `None` if none is worth it. `least` is the least gain that it must promise, `forms` the
-/// sum of squares before the forms of the set.
+/// The best set with one more effect than a set, or in place of one of its own; `None` if none is worth it. `least` is the least gain that
+/// it must promise, `forms` the sum of squares before the forms of the set.
 fn larger(
-    (ctx, mask, effort): (&Context<'_>, &Mask, Effort),
+    how: (&Context<'_>, &Mask, Effort),
+    null: &Fit,
     fit: &Fit,
     (least, forms): (f64, f64),
+    first_choice: bool,
 ) -> Option<Fit> {
+    let (ctx, mask, effort) = how;
     let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
     next.retain(|f| worth_it(ctx, fit, f, forms));
-    next.into_iter().next()
+    let top = next.into_iter().next();
+    // A first choice that leaves something may have been a compromise.
+    let leaves = top.is_some() || surely_left(ctx, fit) > 0.0;
+    let pair = (first_choice && leaves)
+        .then(|| pair_in_place_of(how, null, fit, top.as_ref().unwrap_or(fit)));
+    pair.flatten().or(top)
 }
 
 /// The model alone.
@@ -392,17 +400,9 @@ pub(crate) fn search(
         progress(&format!("looking further beside {}", ids(&fit).join(" + ")));
         let forms = before_forms(ctx, &null, &fit, mask);
         let least = least_gain(ctx, 1, forms - fit.chi2);
-        let how = (ctx, mask, effort);
-        let mut top = larger(how, &fit, (least, forms));
-        // A first choice that leaves something may have been a compromise.
-        if fit.parts.len() == 1
-            && start.is_none()
-            && (top.is_some() || surely_left(ctx, &fit) > 0.0)
-        {
-            let beaten = top.as_ref().unwrap_or(&fit);
-            top = pair_in_place_of(how, &null, &fit, beaten).or(top);
-        }
-        let Some(top) = top else {
+        let first_choice = fit.parts.len() == 1 && start.is_none();
+        let limits = (least, forms);
+        let Some(top) = larger((ctx, mask, effort), &null, &fit, limits, first_choice) else {
             break;
         };
         let top = eliminate(ctx, top, &null, mask, effort);
