@@ -85,19 +85,16 @@ fn pairs(
     let starts: Vec<Part> = chains.flat_map(|v| v.starts(&ctx.scope)).collect();
     let thinned = Thinned::new(mask);
     let mut basis: Vec<Vec<f64>> = Vec::new();
-    let tangents = ctx.tangents(null, mask).columns;
-    let numbers = tangents
-        .iter()
-        .flatten()
-        .map(|(i, _)| i + 1)
-        .max()
-        .unwrap_or(0);
-    for number in 0..numbers {
+    let tangents = ctx.tangents(null, mask);
+    for number in 0..tangents.gradient.len() {
         let of = |(columns, e): (&Vec<(usize, Vec<f64>)>, &Vec<f64>)| {
             let column = columns.iter().find(|(i, _)| *i == number);
             column.map_or_else(|| vec![0.0; e.len()], |(_, c)| c.clone())
         };
-        let whole: Vec<Vec<f64>> = tangents.iter().zip(&null.innovations).map(of).collect();
+        let whole: Vec<Vec<f64>> = (tangents.columns.iter())
+            .zip(&null.innovations)
+            .map(of)
+            .collect();
         let mut column = thinned.of(&whole);
         take_off(&basis, &mut column);
         let size = dot(&column, &column).sqrt();
