@@ -1,4 +1,4 @@
-//! What a stretch of a record tells of the noise: variance and correlation of increments.
+//! The noise that a stretch of a record shows: variance and correlation of increments.
 
 use crate::data::cleaned::{increment_moments, without_jumps, without_lines};
 use crate::data::coloured::Alone;
@@ -88,7 +88,8 @@ impl Estimate {
     ) -> Option<Self> {
         const ROUNDS: usize = 10;
         const SETTLED: f64 = 2e-3;
-        // Noise and response settle together. The step from one round to the next shrinks slowly: it is followed to where it is none.
+        // Noise and response settle together. The change from round to round
+        // shrinks slowly, so a secant goes to the correlation that would not change.
         let mut correlation = self.c1 / self.c0.max(f64::MIN_POSITIVE);
         let mut before: Option<(f64, f64)> = None;
         let mut known = None;
@@ -176,7 +177,8 @@ pub(super) struct Differences<'a> {
 }
 
 impl Differences<'_> {
-    /// The noise of one of the two. A bead that walks is held in closed loop: what follows the difference of the commands is taken off.
+    /// The noise of one of the two. A bead that walks is held in closed loop, and its estimate leaves out
+    /// the linear response to the difference of the commands.
     pub(super) fn noise(&self, sample_s: f64, source: FloorSource, walks: bool) -> Estimate {
         const OF_TWO: f64 = 0.5;
         let raw = of(self.of, self.ok, sample_s, source, OF_TWO);

@@ -1,7 +1,7 @@
 //! Whether the command of a row answers the frame of that row.
 //!
-//! In a closed loop the command is made from the frame, so the frame was taken first. A simulated frame that sees the command of its own
-//! row would be explained by the answer to itself.
+//! In a closed loop the command is made from the frame, so the frame was taken first. If a simulated frame saw the command of its row,
+//! the answer to the frame would explain the frame.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -11,7 +11,7 @@ const BEFORE: usize = 3;
 /// Standard deviations beyond which a correlation is no chance.
 const SURE: f64 = 6.0;
 
-/// Whether a command falls where the bead has just risen, beyond what the rows before tell of both. `rises`: a higher command moves the
+/// Whether a command falls when the bead has just risen, by more than the rows before predict. `rises`: a higher command moves the
 /// bead up.
 pub(crate) fn answers_frames(
     command_um: &[f64],

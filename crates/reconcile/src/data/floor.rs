@@ -125,8 +125,6 @@ fn of_records(
             continue;
         };
         let differences = silent.iter().filter(equal).count() - 1;
-        let apart =
-            |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a - b).collect() };
         let ok: Vec<bool> = (present[i].iter().zip(&present[j]))
             .map(|(a, b)| *a && *b)
             .collect();
@@ -194,17 +192,12 @@ fn between_periods(
         })
         .collect();
     let periods = ok.iter().filter(|ok| **ok).count() as f64 / p as f64;
-    let apart = |values: &[f64]| -> Vec<f64> {
-        (rows.clone())
-            .map(|k| values[k] - values[k - p])
-            .map(|d| if d.is_finite() { d } else { 0.0 })
-            .collect()
-    };
-    let command = apart(&r.pzt_um);
+    let since = |values: &[f64]| apart(&values[rows.clone()], values);
+    let command = since(&r.pzt_um);
     let told = |values: &[f64]| {
         let told = Differences {
             command_um: &command,
-            of: &apart(values),
+            of: &since(values),
             ok: &ok,
         };
         let mut own = told.noise(r.sample_s, FloorSource::Periods, walks);
@@ -217,8 +210,16 @@ fn between_periods(
         .min_by(|a, b| a.sigma().total_cmp(&b.sigma()))
 }
 
-/// Holds of a bead in closed loop: stretches in which the command moves the bead by less than the noise does. What follows the command
-/// linearly is taken off.
+/// Differences row by row; nothing where a value is missing.
+fn apart(a: &[f64], b: &[f64]) -> Vec<f64> {
+    let differences = a.iter().zip(b).map(|(a, b)| a - b);
+    differences
+        .map(|d| if d.is_finite() { d } else { 0.0 })
+        .collect()
+}
+
+/// Holds of a bead in closed loop: stretches in which the command moves the bead by less than the noise does. The estimate leaves out
+/// the linear response to the command.
 fn of_holds(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
     let mut found: Vec<Estimate> = Vec::new();
     for ((r, e), ok) in records.iter().zip(residuals).zip(present) {

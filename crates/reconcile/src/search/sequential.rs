@@ -315,10 +315,8 @@ fn is_hopeless(fit: &Fit, null: &Fit, most: usize) -> bool {
 /// The best single effect; `None` if nothing is worth a name.
 fn first(ctx: &Context<'_>, null: &Fit, mask: &Mask, effort: Effort) -> Option<Fit> {
     let singles = extensions(ctx, null, mask, effort, 8, &[], FREELY);
-    let mut worth = singles
-        .into_iter()
-        .filter(|f| worth_it(ctx, null, f, null.chi2));
-    worth.next()
+    let mut singles = singles.into_iter();
+    singles.find(|f| worth_it(ctx, null, f, null.chi2))
 }
 
 /// The best set with one more effect than a set, or in place of one of its own; `None` if none is worth it. `least` is the least gain that
@@ -331,9 +329,8 @@ fn larger(
     first_choice: bool,
 ) -> Option<Fit> {
     let (ctx, mask, effort) = how;
-    let mut next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
-    next.retain(|f| worth_it(ctx, fit, f, forms));
-    let top = next.into_iter().next();
+    let next = extensions(ctx, fit, mask, effort, 6, &[], [least, f64::INFINITY]);
+    let top = next.into_iter().find(|f| worth_it(ctx, fit, f, forms));
     // A first choice that leaves something may have been a compromise.
     let leaves = top.is_some() || surely_left(ctx, fit) > 0.0;
     let pair = (first_choice && leaves)
