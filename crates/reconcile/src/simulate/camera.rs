@@ -2,6 +2,7 @@
 
 use super::modal::Trace;
 use cellpos_plant::effects::{Block, Piece};
+use std::ops::Range;
 
 /// Properties of the frames.
 #[derive(Debug, Clone, Copy, Default)]
@@ -9,6 +10,44 @@ pub(super) struct Frames {
     pub(super) skew: f64,
     pub(super) delay_s: f64,
     pub(super) exposure_s: f64,
+}
+
+impl Frames {
+    pub(super) fn are_plain(&self, sampling: &Sampling) -> bool {
+        self.skew == 0.0 && self.delay_s == 0.0 && self.exposure_s == 0.0 && sampling.is_plain()
+    }
+
+    /// From and until when a frame that did not wait is exposed, from the instant of its row on an even clock \[s\]. Several windows are
+    /// averaged; equal ends are an instant.
+    pub(super) fn windows(&self, sampling: &Sampling) -> Vec<(f64, f64)> {
+        let known = sampling.exposure_s;
+        // A held command bends the path within an exposure. Its mean is therefore integrated, not taken from single points. Without bends
+        // by the inner mean: two points by Gauss in each half.
+        let near = known * (0.25 - 0.25 / 3f64.sqrt());
+        let far = known * (0.25 + 0.25 / 3f64.sqrt());
+        let middles: &[f64] = match (known > 0.0, self.exposure_s > 0.0) {
+            (true, false) => {
+                return vec![(-0.5 * known - self.delay_s, 0.5 * known - self.delay_s)];
+            }
+            (true, true) => &[-far, -near, near, far],
+            (false, _) => &[0.0],
+        };
+        let window = |middle: &f64| {
+            let until = middle - self.delay_s;
+            (until - self.exposure_s, until)
+        };
+        middles.iter().map(window).collect()
+    }
+}
+
+/// The row, counted backwards from the frame's own, whose edge a frame close behind it does not show.
+///
+/// A frame close behind an edge shows the share of the edge, as a frame equally close in front of it does. Otherwise the sum of squares
+/// would have a cliff at a delay of whole frames, and a fit that starts there would take no step.
+pub(super) fn on_edge(frames: Frames, sampling: &Sampling, sample_s: f64) -> Option<usize> {
+    let late = frames.delay_s / sample_s;
+    let even = frames.skew == 0.0 && frames.exposure_s == 0.0 && sampling.is_plain();
+    near_whole(late).filter(|w| even && late < *w as f64)
 }
 
 /// When the frames of a record were exposed, beyond what effects say.
@@ -31,8 +70,23 @@ pub(crate) struct Waits {
 
 impl Waits {
     #[inline]
-    fn steps(&self, row: usize) -> i16 {
+    pub(super) fn steps(&self, row: usize) -> i16 {
         self.of_row.get(row).copied().unwrap_or(0)
+    }
+
+    /// Stretches of a number of rows that waited equally long, and their steps.
+    pub(super) fn runs(&self, rows: usize) -> Vec<(Range<usize>, i16)> {
+        let known = &self.of_row[..rows.min(self.of_row.len())];
+        let mut runs = Vec::new();
+        let mut start = 0;
+        for run in known.chunk_by(|a, b| a == b) {
+            runs.push((start..start + run.len(), run[0]));
+            start += run.len();
+        }
+        if start < rows {
+            runs.push((start..rows, 0));
+        }
+        runs
     }
 
     /// Wait of a row \[s\].
@@ -43,6 +97,15 @@ impl Waits {
 }
 
 impl Sampling {
+    /// When a window ends that would end at `at`, from the instant of its row, and at `even` on an even clock \[s\]: what a command
+    /// answers ends before it.
+    pub(super) fn not_ahead(&self, at: f64, even: f64) -> f64 {
+        match self.answered {
+            true => at.min(even.max(0.0)),
+            false => at,
+        }
+    }
+
     pub(super) fn is_plain(&self) -> bool {
         self.exposure_s == 0.0 && self.waits.of_row.is_empty()
     }
@@ -85,61 +148,41 @@ pub(crate) fn sample(
     rows: usize,
     y: &mut Vec<f64>,
 ) {
-    let Frames {
-        skew,
-        delay_s: delay,
-        exposure_s: exposure,
-    } = frames;
     y.clear();
     y.reserve(rows);
-    if skew == 0.0 && delay == 0.0 && exposure == 0.0 && sampling.is_plain() {
+    if frames.are_plain(sampling) {
         y.extend(t.pos.iter().step_by(fine));
         return;
     }
-    let known = sampling.exposure_s;
     let path = Path { t, h };
     let sample_s = h * fine as f64;
-    // A held command bends the path within an exposure. Its mean is therefore integrated, not taken from single points.
-    let window = match (known > 0.0, exposure > 0.0) {
-        (true, false) => Some((-0.5 * known, 0.5 * known)),
-        (false, true) => Some((-exposure, 0.0)),
-        _ => None,
-    };
-    let at = |k: usize| {
-        let row_s = k as f64 * sample_s;
-        let at_s = row_s * (1.0 + skew) - delay - sampling.waits.of_row_s(k);
-        match sampling.answered {
-            true => at_s.min(row_s),
-            false => at_s,
-        }
-    };
-    if let Some((from, to)) = window {
-        if skew == 0.0 {
-            let window = (from - delay, to - delay);
-            path.means(window, &sampling.waits, (fine, rows), y);
-        } else {
-            y.extend((0..rows).map(|k| path.mean(at(k) + from, at(k) + to)));
-        }
+    let windows = frames.windows(sampling);
+    if let ([window], 0.0) = (windows.as_slice(), frames.skew)
+        && window.0 < window.1
+    {
+        path.means(*window, &sampling.waits, (fine, rows), y);
         return;
     }
-    // A frame close behind an edge shows the share of the edge, as a frame equally close in front of it does. Otherwise the sum of
-    // squares would have a cliff at a delay of whole frames, and a fit that starts there would take no step.
-    let whole = near_whole(delay / sample_s).filter(|_| sampling.is_plain());
-    let edge = whole.filter(|w| skew == 0.0 && exposure == 0.0 && delay / sample_s < *w as f64);
+    // Where the end of a window lies on the camera's clock.
+    let at = |k: usize, until: f64| {
+        let row_s = k as f64 * sample_s;
+        let ahead_s = row_s * frames.skew - sampling.waits.of_row_s(k);
+        row_s + sampling.not_ahead(until + ahead_s, until)
+    };
+    let edge = on_edge(frames, sampling, sample_s);
     y.extend((0..rows).map(|k| {
-        let at = at(k);
-        if known > 0.0 {
-            // Without bends by the inner mean: two points by Gauss in each half.
-            let near = known * (0.25 - 0.25 / 3f64.sqrt());
-            let far = known * (0.25 + 0.25 / 3f64.sqrt());
-            let seen = |at: f64| path.mean(at - exposure, at);
-            return 0.25 * (seen(at - far) + seen(at - near) + seen(at + near) + seen(at + far));
-        }
-        let shown = edge
-            .and_then(|w| k.checked_sub(w))
-            .filter(|edge| path.step_of(at).0 == edge * fine)
-            .map_or(0.0, |edge| t.jump[edge * fine]);
-        path.position(at) - shown
+        let seen = |(from, until): &(f64, f64)| {
+            let until_s = at(k, *until);
+            if from < until {
+                return path.mean(until_s - (until - from), until_s);
+            }
+            let shown = edge
+                .and_then(|w| k.checked_sub(w))
+                .filter(|edge| path.step_of(until_s).0 == edge * fine)
+                .map_or(0.0, |edge| t.jump[edge * fine]);
+            path.position(until_s) - shown
+        };
+        windows.iter().map(seen).sum::<f64>() / windows.len() as f64
     }));
 }
 

@@ -7,6 +7,7 @@
 mod camera;
 mod input;
 mod modal;
+mod readout;
 
 use camera::Frames;
 pub(crate) use camera::{Sampling, Waits, near_whole};
@@ -17,6 +18,7 @@ pub(crate) use cellpos_plant::{Effect, Place, Zpk};
 pub(crate) use input::Input;
 pub(crate) use input::slew;
 use modal::{Modal, Trace, has_fast_pole};
+use readout::Readout;
 use std::cell::Cell;
 
 /// The plant and the sampling that all records of a problem share.
@@ -224,10 +226,7 @@ impl<'a> Chain<'a> {
         if base.interpolated_input {
             chain.fine = chain.fine.max(4);
         }
-        let f = chain.frames;
-        let frames =
-            f.skew != 0.0 || f.delay_s != 0.0 || f.exposure_s != 0.0 || !sampling.is_plain();
-        let within = frames && !chain.only_late();
+        let within = !chain.frames.are_plain(chain.sampling) && !chain.reads_modes();
         let slopes = chain.motion.iter().any(|b| b.needs_slopes() && b.bends());
         if (within || slopes) && has_fast_pole(&all, base.sample_s / chain.fine as f64) {
             chain.fine = chain.fine.max(4);
@@ -291,37 +290,35 @@ impl<'a> Chain<'a> {
         if let Some(edge) = edge {
             self.edges(&x, modal.direct, n, edge);
         }
-        let f = self.frames;
-        let plain =
-            f.skew == 0.0 && f.delay_s == 0.0 && f.exposure_s == 0.0 && self.sampling.is_plain();
-        if plain && self.motion.is_empty() {
-            let mut pos = Vec::new();
-            modal.run(&x, &mut pos);
-            for zpk in &self.bypass {
-                let mut beside = Vec::new();
-                Modal::new(&pending.clone().series(zpk), h).run(&x, &mut beside);
-                pos.iter_mut().zip(beside).for_each(|(p, b)| *p += b);
-            }
+        let frames = (self.frames, self.sampling);
+        if self.reads_modes() {
             y.clear();
-            y.extend(pos.into_iter().step_by(self.fine));
-            KEPT.set(Room { x, t });
-            return;
+            y.resize(n, 0.0);
+            let readout = Readout::new(frames, h, self.fine);
+            readout.add(&modal, &x, y);
+            for zpk in &self.bypass {
+                let beside = Modal::new(&pending.clone().series(zpk), h);
+                readout.add(&beside, &x, y);
+            }
+        } else {
+            modal.trace(&x, self.fine, &mut t);
+            if self.base.interpolated_input {
+                t.smooth(h);
+            }
+            let carried = self.carried(h);
+            t.add(&carried, 1.0);
+            self.behind_plant(&mut t, &x, &pending, h);
+            t.add(&carried, -1.0);
+            camera::sample(&t, frames, h, self.fine, n, y);
         }
-        if self.only_late() {
-            self.run_late(modal, &x, h, y);
-            KEPT.set(Room { x, t });
-            return;
-        }
-        modal.trace(&x, self.fine, &mut t);
-        if self.base.interpolated_input {
-            t.smooth(h);
-        }
-        let carried = self.carried(h);
-        t.add(&carried, 1.0);
-        self.behind_plant(&mut t, &x, &pending, h);
-        t.add(&carried, -1.0);
-        camera::sample(&t, (f, self.sampling), h, self.fine, n, y);
         KEPT.set(Room { x, t });
+    }
+
+    /// Whether the frames are linear in the states of the modes, each with one age: then no grid finer than that of the input is needed.
+    fn reads_modes(&self) -> bool {
+        let even = self.frames.skew == 0.0 && !self.base.interpolated_input;
+        let linear = self.motion.is_empty() && self.ties.is_empty();
+        linear && (even || self.frames.are_plain(self.sampling))
     }
 
     /// Whether the bead is also carried by a flow next to the displacement, through a plant on whose motion blocks act.
@@ -333,43 +330,6 @@ impl<'a> Chain<'a> {
             Modal::new(&self.plant, h).trace(&fine, self.fine, &mut t);
         }
         t
-    }
-
-    /// Whether a delay is all that lies between plant and record: it is exact without a fine grid.
-    fn only_late(&self) -> bool {
-        let f = self.frames;
-        f.delay_s > 0.0
-            && f.skew == 0.0
-            && f.exposure_s == 0.0
-            && self.sampling.is_plain()
-            && self.motion.is_empty()
-            && self.bypass.is_empty()
-            && self.ties.is_empty()
-            && !self.base.interpolated_input
-    }
-
-    /// Positions a delay earlier than the frames, as [`camera::sample`] has them.
-    fn run_late(&self, modal: Modal, x: &[f64], h: f64, y: &mut Vec<f64>) {
-        let late = self.frames.delay_s / h;
-        let steps = (late + 1e-7).floor() + 1.0;
-        let direct = modal.direct;
-        let mut seen = Vec::new();
-        let at = h * (steps - late).min(1.0);
-        modal.inside(at, h).run(x, &mut seen);
-        let steps = steps as usize;
-        // A frame that close behind an edge shows the share of the edge.
-        let samples = self.frames.delay_s / self.base.sample_s;
-        let edge = camera::near_whole(samples)
-            .is_some_and(|w| samples < w as f64 && steps == w * self.fine);
-        y.clear();
-        y.extend((0..x.len() / self.fine).map(|k| {
-            let Some(j) = (k * self.fine).checked_sub(steps) else {
-                return 0.0;
-            };
-            let before = if j == 0 { 0.0 } else { x[j - 1] };
-            let shown = if edge { direct * (x[j] - before) } else { 0.0 };
-            seen[j] - shown
-        }));
     }
 
     /// What enters the plant, step by step, without the linear blocks that come last before it.

@@ -7,7 +7,7 @@
 use cellpos_plant::Zpk;
 use nalgebra::Complex;
 
-type C = Complex<f64>;
+pub(super) type C = Complex<f64>;
 
 /// Whether any pole is too fast for a step for the slope to be smooth inside it.
 pub(crate) fn has_fast_pole(zpk: &Zpk, step_s: f64) -> bool {
@@ -41,6 +41,7 @@ fn separate(poles: &mut [C]) {
 
 #[derive(Debug, Clone, Copy)]
 struct Mode {
+    p: C,
     a: C,
     b: C,
     weight: C,
@@ -56,7 +57,7 @@ struct Four {
     w: [f64; 4],
     /// Weight in the slope.
     s: [f64; 4],
-    /// Pole \[rad/s\] and drive over a step of the state as it was before scaling, for what lies inside a step.
+    /// Pole \[rad/s\] and drive over a step of the state as it was before scaling.
     p: [f64; 4],
     b: [f64; 4],
 }
@@ -71,15 +72,15 @@ impl Four {
             z[i] = self.a[i] * z[i] + u;
         }
     }
+}
 
-    /// The same without the slope.
-    #[inline(always)]
-    fn step_position(&self, z: &mut [f64; 4], u: f64, y: &mut [f64; 4]) {
-        for i in 0..4 {
-            y[i] += self.w[i] * z[i];
-            z[i] = self.a[i] * z[i] + u;
-        }
-    }
+/// States that a step takes on together.
+pub(super) enum Group {
+    /// Decays of real modes; an input enters with weight 1.
+    Eight([f64; 8]),
+    Four([f64; 4]),
+    /// Decay and drive of a complex mode: real part and imaginary part.
+    Pair(C, C),
 }
 
 fn sum(x: [f64; 4]) -> f64 {
@@ -87,7 +88,7 @@ fn sum(x: [f64; 4]) -> f64 {
 }
 
 /// `(exp(p t) - 1)/p`: the response of a mode after `t` to a constant input of 1.
-fn driven(p: C, t: f64) -> C {
+pub(super) fn driven(p: C, t: f64) -> C {
     let x = p * t;
     if x.norm() < 1e-5 {
         (C::new(1.0, 0.0) + x * 0.5) * t
@@ -203,6 +204,7 @@ impl Modal {
                 }
             } else {
                 complex.push(Mode {
+                    p,
                     a,
                     b,
                     weight: r,
@@ -218,53 +220,53 @@ impl Modal {
         }
     }
 
-    /// Positions just before each input acts: `y_k = C x_k + D u_(k-1)`, from rest.
-    pub(super) fn run(&self, u: &[f64], y: &mut Vec<f64>) {
-        y.clear();
-        y.resize(u.len(), 0.0);
-        let mut states = vec![[0.0; 4]; self.real.len()];
-        let mut before = 0.0;
-        for (y, &u) in y.iter_mut().zip(u) {
-            let mut lanes = [0.0; 4];
-            for (four, z) in self.real.iter().zip(&mut states) {
-                four.step_position(z, u, &mut lanes);
+    /// The states that a step takes on together, in order.
+    pub(super) fn groups(&self) -> impl Iterator<Item = Group> {
+        let (twos, one) = self.real.as_chunks::<2>();
+        let both = |[one, other]: &[Four; 2]| {
+            let mut a = [0.0; 8];
+            a[..4].copy_from_slice(&one.a);
+            a[4..].copy_from_slice(&other.a);
+            Group::Eight(a)
+        };
+        let real = twos.iter().map(both);
+        let real = real.chain(one.iter().map(|four| Group::Four(four.a)));
+        real.chain(self.complex.iter().map(|m| Group::Pair(m.a, m.b)))
+    }
+
+    pub(super) fn states(&self) -> usize {
+        4 * self.real.len() + 2 * self.complex.len()
+    }
+
+    /// Adds the weights of the states in something that is linear in the motion, from what that sees of a mode with a pole.
+    pub(super) fn add_state_weights(&self, seen: impl Fn(C) -> C, weights: &mut [f64]) {
+        let (of_real, of_complex) = weights.split_at_mut(4 * self.real.len());
+        for (four, weights) in self.real.iter().zip(of_real.chunks_exact_mut(4)) {
+            for (i, weight) in weights
+                .iter_mut()
+                .enumerate()
+                .filter(|(i, _)| four.b[*i] != 0.0)
+            {
+                *weight += four.w[i] * seen(C::new(four.p[i], 0.0)).re;
             }
-            *y = self.direct * before + sum(lanes);
-            before = u;
         }
-        for m in &self.complex {
-            let mut z = C::new(0.0, 0.0);
-            for (y, &u) in y.iter_mut().zip(u) {
-                *y += m.weight.re * z.re - m.weight.im * z.im;
-                z = m.a * z + m.b * u;
-            }
+        for (m, weights) in self.complex.iter().zip(of_complex.chunks_exact_mut(2)) {
+            let w = m.weight * seen(m.p);
+            weights[0] += w.re;
+            weights[1] -= w.im;
         }
     }
 
-    /// The same chain seen `t` after the start of each step of `h`, 0 < t <= h: for [`Inside::run`].
-    pub(super) fn inside(mut self, t: f64, h: f64) -> Inside {
-        let mut feed = self.direct;
-        for four in &mut self.real {
-            for i in 0..4 {
-                if four.b[i] == 0.0 {
-                    continue;
-                }
-                let p = C::new(four.p[i], 0.0);
-                feed += four.w[i] / four.b[i] * driven(p, t).re;
-                four.w[i] *= (p * t).exp().re;
-            }
-        }
-        for m in &mut self.complex {
-            // The pole from its slope and weight; a weight of nothing drives nothing.
-            if m.weight.norm() > 0.0 {
-                let p = m.slope / m.weight;
-                feed += (m.weight * driven(p, t)).re;
-                m.weight *= (p * t).exp();
-            }
-        }
-        // Just before the next step's input acts, the direct path still shows this step's.
-        debug_assert!(t > 0.0 && t <= h * (1.0 + 1e-6));
-        Inside { modal: self, feed }
+    /// Sum over the modes of what is seen of each times its residue.
+    pub(super) fn residues(&self, seen: impl Fn(C) -> C) -> f64 {
+        let lanes = self
+            .real
+            .iter()
+            .flat_map(|four| (0..4).map(move |i| (four, i)));
+        let used = lanes.filter(|(four, i)| four.b[*i] != 0.0);
+        let real = used.map(|(four, i)| four.w[i] / four.b[i] * seen(C::new(four.p[i], 0.0)).re);
+        let complex = self.complex.iter().map(|m| (m.weight * seen(m.p)).re);
+        real.sum::<f64>() + complex.sum::<f64>()
     }
 
     /// Positions with jumps and slopes, for what acts on the motion inside a step (adhesion, delay, exposure).
@@ -407,26 +409,5 @@ impl Modal {
                 0.5 * (start + end)
             })
             .collect()
-    }
-}
-
-/// A chain seen at one instant inside every step: exact, so that a delay needs no finer grid.
-#[derive(Debug, Clone)]
-pub(crate) struct Inside {
-    modal: Modal,
-    /// The effect of the step's input by then.
-    feed: f64,
-}
-
-impl Inside {
-    /// The position at that instant of every step.
-    pub(super) fn run(&self, u: &[f64], y: &mut Vec<f64>) {
-        let direct = self.modal.direct;
-        self.modal.run(u, y);
-        let mut before = 0.0;
-        for (y, &u) in y.iter_mut().zip(u) {
-            *y += self.feed * u - direct * before;
-            before = u;
-        }
     }
 }

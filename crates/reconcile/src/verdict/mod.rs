@@ -3,6 +3,7 @@
 mod assemble;
 mod augment;
 pub(crate) mod battery;
+mod beside_zero_flow;
 mod counted;
 mod form;
 pub(crate) mod guard;

@@ -3,7 +3,6 @@
 use crate::data::coloured::NoiseKind;
 use crate::data::estimate::error_of;
 use crate::data::floor::{Floor, refined};
-use crate::data::flow_loss::FlowLoss;
 use crate::data::noise::NoiseModel;
 use crate::fit::catalogue::{self, Part};
 use crate::fit::context::{Context, Fit, WhiteEvidence, freedom_of};
@@ -11,17 +10,17 @@ use crate::problem::Problem;
 use crate::search::cost::{penalised_cost, threshold_of};
 use crate::search::effort::Effort;
 use crate::search::found::Found;
-use crate::search::sequential::{alike, search, within};
+use crate::search::sequential::{alike, search};
 use crate::thresholds::NUMBER;
 use crate::units::Scales;
 use crate::verdict::jumps::Jumps;
 use crate::verdict::late_frames::LateFrames;
 use crate::verdict::wandering::{Wandering, prior_of, suspected};
-use cellpos_plant::effects::{Action, Place, Scope};
+use cellpos_plant::effects::Scope;
 use cellpos_plant::{Effect, Model};
 
 /// In twice the log-likelihood: another estimate of the zero flow changes nothing that decides.
-const SETTLED: f64 = 1.0;
+pub(super) const SETTLED: f64 = 1.0;
 
 /// What every search of a reconciliation shares.
 pub(super) struct Searching<'a> {
@@ -66,7 +65,7 @@ impl Searching<'_> {
         }
     }
 
-    fn effects(&self, fit: &Fit) -> Vec<Effect> {
+    pub(super) fn effects(&self, fit: &Fit) -> Vec<Effect> {
         fit.parts.iter().map(|p| p.effect(&self.scope)).collect()
     }
 
@@ -287,11 +286,12 @@ impl Searching<'_> {
             if moving.found.cut_short {
                 return moving;
             }
-            let mut weighed = self.settled_zero_flow(&moving.problem, &moving.found.fit);
-            if let Some(exchanged) = self.weigh_rivals(&mut moving, &weighed) {
+            let mut weighed =
+                self.settled_zero_flow(&moving.problem, &moving.found.fit, effort.threads);
+            if let Some(exchanged) = self.weigh_rivals(&mut moving, &weighed, effort.threads) {
                 weighed = exchanged;
             }
-            if let Some(smaller) = self.weigh_smaller(&weighed) {
+            if let Some(smaller) = self.weigh_smaller(&weighed, effort.threads) {
                 weighed = smaller;
             }
             if weighed.cost > self.cost(&moving.problem, &moving.found.fit) - SETTLED {
@@ -322,7 +322,7 @@ impl Searching<'_> {
             .refit(&moving.found.fit, &problem.all(), 8);
         let besides = self.cost(&problem, &start) - start.chi2;
         let effort = Effort {
-            to_beat: self.cost(&moving.problem, &moving.found.fit) - besides,
+            to_beat: self.cost(&moving.problem, &moving.found.fit) - besides + SETTLED,
             ..effort
         };
         let still = self.search(problem, floor, effort, Some(start), &mut *progress);
@@ -334,131 +334,14 @@ impl Searching<'_> {
             .iter()
             .all(|p| still.found.fit.has(p.id()));
         let cost = |s: &Searched| self.cost(&s.problem, &s.found.fit);
-        match keeps && cost(&still) < cost(&moving) {
+        match keeps && !still.found.cut_short && cost(&still) < cost(&moving) {
             true => still,
             false => moving,
         }
     }
 
-    /// Weighs the rivals of a set, each under the noise that it leaves itself: the model's stated error acts beside it, and it leaves another
-    /// zero flow. `own` is the set under its noise. The best set with a rival in it that is more probable than `own`.
-    ///
-    /// Under the noise of the set a rival has to explain what that noise takes up.
-    fn weigh_rivals(&self, searched: &mut Searched, own: &Weighed) -> Option<Weighed> {
-        let Searched { found, problem } = searched;
-        let unpriced = |w: &Weighed| w.cost - self.prices(&w.problem, &w.fit);
-        let (here, reach) = (unpriced(own), within(&found.fit));
-        let mut best: Option<Weighed> = None;
-        for (place, rivals) in found.rivals.iter_mut().enumerate() {
-            let id = found.fit.parts[place].id();
-            for rival in rivals {
-                if rival.id == id || rival.chi2 - found.fit.chi2 > reach {
-                    continue;
-                }
-                let mut parts = found.fit.parts.clone();
-                parts[place] = rival.part.clone();
-                let ctx = self.context(problem, 0);
-                let fit = ctx.fit_from(parts, Some(found.fit.soft), &problem.all(), 8);
-                let weighed = self.with_zero_flow(problem, &fit, f64::INFINITY);
-                rival.chi2 = found.fit.chi2 + unpriced(&weighed) - here;
-                rival.part = weighed.fit.parts[place].clone();
-                if weighed.cost < best.as_ref().unwrap_or(own).cost {
-                    best = Some(weighed);
-                }
-            }
-        }
-        best
-    }
-
-    /// Weighs a set without each of its parts, each under the noise that it leaves itself: a small part may stand for the path of a zero
-    /// flow. Any may where the flow does not pass the chip linearly, because there a zero flow in the noise is no zero flow. The best set
-    /// that is more probable.
-    fn weigh_smaller(&self, own: &Weighed) -> Option<Weighed> {
-        let bends = |e: &Effect| {
-            let in_chip = matches!(e.kind().spec().place, Place::Chip | Place::Bead);
-            in_chip && matches!(e.act(), Action::Block(_))
-        };
-        let count = own.fit.parts.len();
-        if count < 2 {
-            return None;
-        }
-        let any = self.effects(&own.fit).iter().any(bends);
-        let most = own.fit.chi2 + within(&own.fit);
-        let ctx = self.context(&own.problem, 0);
-        let all = own.problem.all();
-        let without = (0..count).map(|i| ctx.fit_without(&own.fit, i, &all, 8));
-        let weighed = (without.filter(|fit| any || fit.chi2 < most))
-            .map(|fit| self.with_zero_flow(&own.problem, &fit, own.cost));
-        weighed
-            .min_by(|a, b| a.cost.total_cmp(&b.cost))
-            .filter(|best| best.cost < own.cost)
-    }
-
-    /// A set with the zero flow that it leaves, each fitted to the other until neither changes.
-    fn settled_zero_flow(&self, problem: &Problem, fit: &Fit) -> Weighed {
-        const MOST_ROUNDS: usize = 3;
-        let mut best = self.with_zero_flow(problem, fit, f64::INFINITY);
-        for _ in 1..MOST_ROUNDS {
-            let next = self.with_zero_flow(&best.problem, &best.fit, f64::INFINITY);
-            let gained = best.cost - next.cost;
-            if gained > 0.0 {
-                best = next;
-            }
-            if gained < SETTLED {
-                break;
-            }
-        }
-        best
-    }
-
-    /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow. The model's
-    /// stated error acts beside the set. What cannot become cheaper than `to_beat` is not followed to the end.
-    fn with_zero_flow(&self, problem: &Problem, fit: &Fit, to_beat: f64) -> Weighed {
-        /// A path gains half as much as the previous one: all that follow gain as much as it.
-        const MOST_PATHS: usize = 12;
-        let residual = |problem: &Problem, fit: &Fit| self.context(problem, 0).residual(fit).0;
-        let weighed = |problem: Problem, fit: &Fit| {
-            let fit = self.context(&problem, 0).refit(fit, &problem.all(), 8);
-            Weighed {
-                cost: self.cost(&problem, &fit),
-                problem,
-                fit,
-            }
-        };
-        let left = residual(problem, fit);
-        let effects = self.effects(fit);
-        let problem = problem.clone().beside(&effects);
-        let estimate = |loss: Option<FlowLoss>| {
-            let begun = problem.noise.with_loss(loss);
-            let noise =
-                prior_of(&problem).estimate(&begun, |noise| problem.unlikelihood(noise, &left));
-            weighed(problem.clone().with_noise(noise), fit)
-        };
-        // A zero flow ahead of the chip passes through it, one behind it does not. Before the records are seen both are as likely.
-        let mut best = estimate(None);
-        if let Some(loss) = problem.flow_loss(&effects) {
-            let ahead = estimate(Some(loss));
-            if ahead.cost < best.cost {
-                best = ahead;
-            }
-        }
-        for _ in 0..MOST_PATHS {
-            let left = residual(&best.problem, &best.fit);
-            let next = weighed(best.problem.clone().with_flow(&left), &best.fit);
-            let gained = best.cost - next.cost;
-            if gained < SETTLED {
-                break;
-            }
-            best = next;
-            if best.cost - gained > to_beat {
-                break;
-            }
-        }
-        best
-    }
-
     /// Twice the negative log-likelihood of a set under a problem's noise, with the price of the zero flow and of the set.
-    fn cost(&self, problem: &Problem, fit: &Fit) -> f64 {
+    pub(super) fn cost(&self, problem: &Problem, fit: &Fit) -> f64 {
         let (residual, _) = self.context(problem, 0).residual(fit);
         fit.chi2
             + self.prices(problem, fit)
@@ -469,7 +352,7 @@ impl Searching<'_> {
     }
 
     /// The prices of a set: those of a search and, for each part, what any addition must gain.
-    fn prices(&self, problem: &Problem, fit: &Fit) -> f64 {
+    pub(super) fn prices(&self, problem: &Problem, fit: &Fit) -> f64 {
         let records = problem.records.len();
         let dearer = |p: &Part| {
             threshold_of(p.variant(), records) - NUMBER * freedom_of(p.variant(), records) as f64
@@ -477,11 +360,4 @@ impl Searching<'_> {
         penalised_cost(&self.context(problem, 0), fit) - fit.chi2
             + fit.parts.iter().map(dearer).sum::<f64>().max(0.0)
     }
-}
-
-/// A set with the noise that it leaves, and their joint cost.
-struct Weighed {
-    problem: Problem,
-    fit: Fit,
-    cost: f64,
 }
