@@ -51,7 +51,7 @@ impl Searching<'_> {
             parts[*place] = rival.part.clone();
             let ctx = self.context(problem, 0);
             let fit = ctx.fit_from(parts, Some(fit.soft), &problem.all(), 8);
-            self.with_zero_flow(problem, &fit, f64::INFINITY, threads)
+            self.settled_zero_flow(problem, &fit, own.cost, threads)
         });
         for ((place, rival), weighed) in rivals.iter_mut().zip(&weighed) {
             rival.chi2 = fit.chi2 + unpriced(weighed) - here;
@@ -78,24 +78,29 @@ impl Searching<'_> {
         let weighed = parallel::map(&parts, threads, |part| {
             let fit = ctx.fit_without(&own.fit, *part, &all, 8);
             (any || fit.chi2 < most)
-                .then(|| self.with_zero_flow(&own.problem, &fit, own.cost, threads))
+                .then(|| self.settled_zero_flow(&own.problem, &fit, own.cost, threads))
         });
         (weighed.into_iter().flatten())
             .min_by(|a, b| a.cost.total_cmp(&b.cost))
             .filter(|best| best.cost < own.cost)
     }
 
-    /// A set with the zero flow that it leaves, each fitted to the other until neither changes.
+    /// A set with the zero flow that it leaves, each fitted to the other until neither changes. What is far from `to_beat` is not followed
+    /// to the end.
     pub(super) fn settled_zero_flow(
         &self,
         problem: &Problem,
         fit: &Fit,
+        to_beat: f64,
         threads: usize,
     ) -> Weighed {
         const MOST_ROUNDS: usize = 3;
-        let mut best = self.with_zero_flow(problem, fit, f64::INFINITY, threads);
+        let mut best = self.with_zero_flow(problem, fit, to_beat, threads);
         for _ in 1..MOST_ROUNDS {
-            let next = self.with_zero_flow(&best.problem, &best.fit, f64::INFINITY, threads);
+            if best.cost - within(&best.fit) > to_beat {
+                break;
+            }
+            let next = self.with_zero_flow(&best.problem, &best.fit, to_beat, threads);
             let gained = best.cost - next.cost;
             if gained > 0.0 {
                 best = next;

@@ -286,8 +286,12 @@ impl Searching<'_> {
             if moving.found.cut_short {
                 return moving;
             }
-            let mut weighed =
-                self.settled_zero_flow(&moving.problem, &moving.found.fit, effort.threads);
+            let mut weighed = self.settled_zero_flow(
+                &moving.problem,
+                &moving.found.fit,
+                f64::INFINITY,
+                effort.threads,
+            );
             if let Some(exchanged) = self.weigh_rivals(&mut moving, &weighed, effort.threads) {
                 weighed = exchanged;
             }
