@@ -8,6 +8,7 @@ mod camera;
 mod input;
 mod modal;
 mod readout;
+mod walk;
 
 use camera::Frames;
 pub(crate) use camera::{Sampling, Waits, near_whole};
