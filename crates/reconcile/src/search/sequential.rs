@@ -385,7 +385,7 @@ pub(crate) fn search(
     }
     // The last set whose effects were weighed against their rivals.
     let mut weighed: Option<(Fit, Vec<Vec<Rival>>)> = None;
-    let (mut cut_short, mut beaten) = (false, false);
+    let mut cut_short = false;
     while fit.parts.len() < effort.max_effects {
         if effort.is_spent(ctx) {
             cut_short = true;
@@ -407,7 +407,6 @@ pub(crate) fn search(
             break;
         }
         if effort.is_beaten(&top, fit.chi2 - top.chi2) {
-            beaten = true;
             break;
         }
         // A richer form of a present effect may explain as much as the next name.
@@ -439,7 +438,7 @@ pub(crate) fn search(
     }
     // A set that cannot beat another is not told. Rivals of a set that is no whole explanation, and that nothing more will be added to,
     // decide nothing: no name.
-    let beaten = beaten || effort.is_beaten(&fit, 0.0);
+    let beaten = effort.is_beaten(&fit, 0.0);
     let (fit, rivals) = if beaten || cut_short && leaves_much(&null, &fit) {
         let none = vec![Vec::new(); fit.parts.len()];
         (fit, none)

@@ -97,8 +97,8 @@ impl Waits {
 }
 
 impl Sampling {
-    /// When a window ends that would end at `at`, from the instant of its row, and at `even` on an even clock \[s\]: what a command
-    /// answers ends before it.
+    /// End of a window, from the instant of its row \[s\]. It is `at` on the camera's clock and `even` on an even one. A frame that a command
+    /// answers ends before the command.
     pub(super) fn not_ahead(&self, at: f64, even: f64) -> f64 {
         match self.answered {
             true => at.min(even.max(0.0)),
@@ -163,7 +163,7 @@ pub(crate) fn sample(
         path.means(*window, &sampling.waits, (fine, rows), y);
         return;
     }
-    // Where the end of a window lies on the camera's clock.
+    // The end of a window on the camera's clock.
     let at = |k: usize, until: f64| {
         let row_s = k as f64 * sample_s;
         let ahead_s = row_s * frames.skew - sampling.waits.of_row_s(k);

@@ -44,19 +44,17 @@ impl<'a> Readout<'a> {
         step_s: f64,
         fine: usize,
     ) -> Self {
-        let windows = frames.windows(sampling);
-        let instant = windows.iter().all(|(from, until)| from == until);
-        let edge = on_edge(frames, sampling, step_s * fine as f64).filter(|_| instant);
+        let edge = on_edge(frames, sampling, step_s * fine as f64);
         Self {
             sampling,
-            windows,
+            windows: frames.windows(sampling),
             edge: edge.map(|rows| -((rows * fine) as isize)),
             step_s,
             fine,
         }
     }
 
-    /// Adds what the frames show of a chain under an input that is constant in every step.
+    /// Adds the part of a chain in the frames, under an input that is constant in every step.
     pub(super) fn add(&self, modal: &Modal, x: &[f64], y: &mut [f64]) {
         let mut laid_out: Vec<(i16, Weights)> = Vec::new();
         let mut runs: Vec<Run> = Vec::new();
@@ -131,7 +129,7 @@ impl<'a> Readout<'a> {
     /// Adds the part of the inputs since the start of the row that the weights count from.
     fn add_inputs(&self, weights: &Weights, x: &[f64], rows: Range<usize>, y: &mut [f64]) {
         let Weights { row, inputs, .. } = weights;
-        // Rows whose inputs all lie in the record.
+        // Rows whose inputs are all in the record.
         let behind = (x.len() + self.fine).saturating_sub(inputs.len()) / self.fine;
         let begin = row.min(&0).unsigned_abs().clamp(rows.start, rows.end);
         let end = behind.saturating_add_signed(-row).clamp(begin, rows.end);

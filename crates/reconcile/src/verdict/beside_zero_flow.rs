@@ -17,6 +17,13 @@ pub(super) struct Weighed {
     pub cost: f64,
 }
 
+impl Weighed {
+    /// The cost up to which another set may still decide something.
+    fn most(&self) -> f64 {
+        self.cost + within(&self.fit)
+    }
+}
+
 /// Whether any of the effects acts on the flow that passes the chip in another way than linearly.
 fn acts_on_flow(ctx: &Context<'_>, fit: &Fit) -> bool {
     ctx.effects(&fit.parts).iter().any(|e| {
@@ -26,7 +33,7 @@ fn acts_on_flow(ctx: &Context<'_>, fit: &Fit) -> bool {
 }
 
 impl Searching<'_> {
-    /// Weighs the rivals of a set, each under the noise that it leaves itself: the model's stated error acts beside it, and it leaves another
+    /// Weighs the rivals of a set, each under the noise that it leaves itself: the model's stated error acts together with it, and it leaves another
     /// zero flow. `own` is the set under its noise. The best set with a rival in it that is more probable than `own`.
     ///
     /// Under the noise of the set a rival has to explain what that noise takes up.
@@ -40,6 +47,7 @@ impl Searching<'_> {
         let unpriced = |w: &Weighed| w.cost - self.prices(&w.problem, &w.fit);
         let (here, reach) = (unpriced(own), within(&found.fit));
         let fit = &found.fit;
+        let most = own.most();
         let mut rivals: Vec<(usize, &mut Rival)> = (found.rivals.iter_mut().enumerate())
             .flat_map(|(place, rivals)| rivals.iter_mut().map(move |rival| (place, rival)))
             .filter(|(place, rival)| {
@@ -51,7 +59,7 @@ impl Searching<'_> {
             parts[*place] = rival.part.clone();
             let ctx = self.context(problem, 0);
             let fit = ctx.fit_from(parts, Some(fit.soft), &problem.all(), 8);
-            self.settled_zero_flow(problem, &fit, own.cost, threads)
+            self.settled_zero_flow(problem, &fit, most, threads)
         });
         for ((place, rival), weighed) in rivals.iter_mut().zip(&weighed) {
             rival.chi2 = fit.chi2 + unpriced(weighed) - here;
@@ -78,29 +86,29 @@ impl Searching<'_> {
         let weighed = parallel::map(&parts, threads, |part| {
             let fit = ctx.fit_without(&own.fit, *part, &all, 8);
             (any || fit.chi2 < most)
-                .then(|| self.settled_zero_flow(&own.problem, &fit, own.cost, threads))
+                .then(|| self.settled_zero_flow(&own.problem, &fit, own.most(), threads))
         });
         (weighed.into_iter().flatten())
             .min_by(|a, b| a.cost.total_cmp(&b.cost))
             .filter(|best| best.cost < own.cost)
     }
 
-    /// A set with the zero flow that it leaves, each fitted to the other until neither changes. What is far from `to_beat` is not followed
-    /// to the end.
+    /// A set with the zero flow that it leaves, each fitted to the other until neither changes. A set that stays above a cost of `most` is not
+    /// followed to the end.
     pub(super) fn settled_zero_flow(
         &self,
         problem: &Problem,
         fit: &Fit,
-        to_beat: f64,
+        most: f64,
         threads: usize,
     ) -> Weighed {
         const MOST_ROUNDS: usize = 3;
-        let mut best = self.with_zero_flow(problem, fit, to_beat, threads);
+        let mut best = self.with_zero_flow(problem, fit, most, threads);
         for _ in 1..MOST_ROUNDS {
-            if best.cost - within(&best.fit) > to_beat {
+            if best.cost > most {
                 break;
             }
-            let next = self.with_zero_flow(&best.problem, &best.fit, to_beat, threads);
+            let next = self.with_zero_flow(&best.problem, &best.fit, most, threads);
             let gained = best.cost - next.cost;
             if gained > 0.0 {
                 best = next;
@@ -113,14 +121,8 @@ impl Searching<'_> {
     }
 
     /// A set fitted again with the most probable zero flow of its residuals: in the noise, and below what acts on the flow. The model's
-    /// stated error acts beside the set. What cannot become cheaper than `to_beat` is not followed to the end.
-    fn with_zero_flow(
-        &self,
-        problem: &Problem,
-        fit: &Fit,
-        to_beat: f64,
-        threads: usize,
-    ) -> Weighed {
+    /// stated error acts together with the set. A set that cannot come down to a cost of `most` is not followed to the end.
+    fn with_zero_flow(&self, problem: &Problem, fit: &Fit, most: f64, threads: usize) -> Weighed {
         /// A path gains half as much as the previous one: all that follow gain as much as it.
         const MOST_PATHS: usize = 12;
         let residual = |problem: &Problem, fit: &Fit| self.context(problem, 0).residual(fit).0;
@@ -166,7 +168,7 @@ impl Searching<'_> {
                 break;
             }
             best = next;
-            if best.cost - gained > to_beat {
+            if best.cost - gained > most {
                 break;
             }
         }

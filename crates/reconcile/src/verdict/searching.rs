@@ -330,7 +330,8 @@ impl Searching<'_> {
             ..effort
         };
         let still = self.search(problem, floor, effort, Some(start), &mut *progress);
-        // An effect that is found next to a moving zero flow is there without one, too: else a leak may stand for both.
+        // An effect that is found next to a moving zero flow is there without one, too: else a leak may stand for both. A search that was cut
+        // short may not have weighed its rivals.
         let keeps = moving
             .found
             .fit
