@@ -121,6 +121,24 @@ impl Prepared {
         (e, log_determinant)
     }
 
+    /// The filter and the free motions of a noise for which the bead may have gone anywhere in some rows.
+    fn blind(&self, noise: &NoiseModel, stops: &[bool]) -> (Whitener, Free) {
+        /// Variance of such a row over that of the noise: a thousand rows of it tell a tenth of what one other tells.
+        const ANYWHERE: f64 = 1e4;
+        let flow_um2 = noise.zero_flow.map_or(0.0, |z| z.motion_um2);
+        let anywhere = ANYWHERE * (noise.walk_um2 + flow_um2);
+        let walk_um2 = |(k, stops): (usize, &bool)| {
+            self.row_noise.walk_um2(k) + if *stops { anywhere } else { 0.0 }
+        };
+        let rows = RowNoise {
+            walk: Some(stops.iter().enumerate().map(walk_um2).collect()),
+            white: self.row_noise.white.clone(),
+        };
+        let whitener = Whitener::new(noise, &self.present, &rows);
+        let free = Free::new(noise, &whitener, &self.transients, &self.flow, &[]);
+        (whitener, free)
+    }
+
     /// A residual, or its first rows, without the transients, a level and, if asked for, a ramp.
     pub(crate) fn without_start(&self, residual: &[f64], ramp: bool) -> Vec<f64> {
         let n = residual.len();
@@ -384,16 +402,26 @@ impl Problem {
         FlowLoss::of(&[own, effects].concat(), self.base.sample_s)
     }
 
-    /// The same problem with the zero flow where the residuals of a fit say that it was.
-    pub(crate) fn with_flow(mut self, residuals: &[Vec<f64>]) -> Self {
-        let per_um = self.base.speed_per_um() * self.base.sample_s;
+    /// The same problem with the zero flow where the residuals of a fit say that it was. `stops` are the rows in which the bead does not
+    /// follow the flow, none of a record without such rows: there the residual says nothing of it.
+    pub(crate) fn with_flow(mut self, residuals: &[Vec<f64>], stops: &[Vec<bool>]) -> Self {
+        let per_um = self.flow_per_um();
         let off = self.base.free_working_point;
-        for (r, residual) in self.records.iter_mut().zip(residuals) {
-            let by = (&r.whitener, &r.free);
+        for ((r, residual), stops) in self.records.iter_mut().zip(residuals).zip(stops) {
+            let blind = stops.contains(&true).then(|| r.blind(&self.noise, stops));
+            let by = match &blind {
+                Some((whitener, free)) => (whitener, free),
+                None => (&r.whitener, &r.free),
+            };
             r.flow_um = flow_estimate::motion_um(&self.noise, by, &r.flow, off, residual);
             r.flow_um.iter_mut().for_each(|m| *m /= per_um);
         }
         self
+    }
+
+    /// Motion of the bead in a row by a flow like that of a displacement \[um/um\].
+    pub(crate) fn flow_per_um(&self) -> f64 {
+        self.base.speed_per_um() * self.base.sample_s
     }
 
     /// Which rows of each record hold a position that counts.

@@ -11,7 +11,7 @@ pub(crate) struct RowNoise {
 
 impl RowNoise {
     /// Gain of the walk before row `k` \[um^2\].
-    pub(super) fn walk_um2(&self, k: usize) -> f64 {
+    pub(crate) fn walk_um2(&self, k: usize) -> f64 {
         self.walk.as_ref().map_or(0.0, |w| w[k])
     }
 

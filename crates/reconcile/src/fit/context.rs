@@ -302,6 +302,44 @@ impl Context<'_> {
         self.problem.spend(work);
     }
 
+    /// Rows of each record in which the bead follows less than half of a small change of the zero flow: it sticks, or is held.
+    pub(crate) fn stops(&self, fit: &Fit) -> Vec<Vec<bool>> {
+        /// Rows after which the change turns round: a leak has not yet taken it back.
+        const TURNS: usize = 100;
+        let sign = |k: usize| {
+            if (k / TURNS).is_multiple_of(2) {
+                1.0
+            } else {
+                -1.0
+            }
+        };
+        let effects = self.effects(&fit.parts);
+        let per_um = self.problem.flow_per_um();
+        let motion_um2 = self.problem.noise.zero_flow.map_or(0.0, |z| z.motion_um2);
+        let change_um = motion_um2.sqrt() / per_um;
+        let of = |record: &Prepared| {
+            if change_um == 0.0 {
+                return Vec::new();
+            }
+            let with_flow = |added_um: f64| {
+                let mut record = record.clone();
+                record.flow_um.resize(record.u.len(), 0.0);
+                let rows = record.flow_um.iter_mut().enumerate();
+                rows.for_each(|(k, f)| *f += sign(k) * added_um);
+                let mut y = Vec::new();
+                self.simulate(&record, &effects, fit.offset_um, &mut y, None);
+                y
+            };
+            let (low, high) = (with_flow(-change_um), with_flow(change_um));
+            let apart: Vec<f64> = high.iter().zip(&low).map(|(h, l)| h - l).collect();
+            // The zero flow itself is noise of the position: what a simulation shows of it is what the bead does not follow.
+            let whole = 2.0 * change_um * per_um;
+            let lost = |k: usize| (apart[k] - apart[k - 1]) / (sign(k - 1) * whole);
+            (0..apart.len()).map(|k| k > 0 && lost(k) < -0.5).collect()
+        };
+        self.problem.records.iter().map(of).collect()
+    }
+
     /// By how much a part next to a set would change the innovations; `sim` is the set's simulation.
     pub(crate) fn change(
         &self,

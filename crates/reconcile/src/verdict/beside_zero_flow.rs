@@ -157,12 +157,13 @@ impl Searching<'_> {
         // The path of a flow on which nothing acts is noise alone.
         if !acts_on_flow(&self.context(&best.problem, 0), &best.fit) {
             let left = residual(&best.problem, &best.fit);
-            best.problem = best.problem.with_flow(&left);
+            best.problem = best.problem.with_flow(&left, &vec![Vec::new(); left.len()]);
             return best;
         }
         for _ in 0..MOST_PATHS {
             let left = residual(&best.problem, &best.fit);
-            let next = weighed(best.problem.clone().with_flow(&left), &best.fit);
+            let stops = self.context(&best.problem, 0).stops(&best.fit);
+            let next = weighed(best.problem.clone().with_flow(&left, &stops), &best.fit);
             let gained = best.cost - next.cost;
             if gained < SETTLED {
                 break;

@@ -207,6 +207,11 @@ fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Opti
             "the best of the catalogue, {best}, explains no more than a curve of the response without memory: no name"
         ));
     }
+    if let Some(id) = e.names.drowned {
+        return Some(format!(
+            "the best of the catalogue is {best}, but {id} gains no more than what is left beyond the noise may give by chance: no name"
+        ));
+    }
     if open && closed < THRESHOLDS.closed_least {
         return Some(format!(
             "the best of the catalogue, {best}, closes {:.0} % of it: not enough for a name",

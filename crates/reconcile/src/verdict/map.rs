@@ -76,6 +76,50 @@ fn cell(energy: f64, n: f64, sigma_um: f64, slack: f64, limit: f64) -> Cell {
     }
 }
 
+/// Sum of squares of a row of innovations in each band, and how many numbers each band has.
+fn energy_by_band(e: &[f64], edges_hz: &[f64], sample_s: f64) -> (Vec<f64>, Vec<f64>) {
+    let bands = edges_hz.len() - 1;
+    let n = e.len();
+    let (mut energy, mut bins) = (vec![0.0; bands], vec![0.0; bands]);
+    for (k, x) in transform(e).iter().enumerate() {
+        let hz = k as f64 / (n as f64 * sample_s);
+        let Some(b) = edges_hz[..bands].iter().rposition(|start| hz >= *start) else {
+            continue;
+        };
+        let double = if k == 0 || 2 * k == n { 1.0 } else { 2.0 };
+        energy[b] += double * x.norm_sqr() / n as f64;
+        bins[b] += double;
+    }
+    (energy, bins)
+}
+
+/// Variance of what a fit leaves along a change of the innovations, relative to that of the noise: at least 1. Each band of each record
+/// counts by what the change has there.
+///
+/// Where more than the noise is left, as beside an unknown effect or behind a noise that was stated wrongly, a change along which as much is
+/// left gains as much more by chance.
+pub(crate) fn left_along(ctx: &Context<'_>, fit: &Fit, change: &[Vec<f64>]) -> f64 {
+    let sample_s = ctx.problem.base.sample_s;
+    let edges_hz = band_edges_hz(sample_s);
+    let (mut left, mut whole) = (0.0, 0.0);
+    for ((r, e), d) in (ctx.problem.records.iter().zip(&fit.innovations)).zip(change) {
+        let share = r.whitener.count() as f64 / e.len() as f64;
+        let (energy, bins) = energy_by_band(e, &edges_hz, sample_s);
+        let (of_change, _) = energy_by_band(d, &edges_hz, sample_s);
+        for ((energy, bins), of_change) in energy.iter().zip(&bins).zip(&of_change) {
+            if *bins > 0.0 {
+                left += of_change * energy / (share * bins);
+                whole += of_change;
+            }
+        }
+    }
+    if whole > 0.0 {
+        (left / whole).max(1.0)
+    } else {
+        1.0
+    }
+}
+
 /// Makes the map.
 pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     let sample_s = ctx.problem.base.sample_s;
@@ -85,22 +129,10 @@ pub(crate) fn map(ctx: &Context<'_>, fit: &Fit) -> DiscrepancyMap {
     let limit = CHANCE_SD;
     let mut rows = Vec::new();
     for (r, e) in ctx.problem.records.iter().zip(&fit.innovations) {
-        let spectrum = transform(e);
-        let n = e.len();
-        let share = r.whitener.count() as f64 / n as f64;
-        let mut energy = vec![0.0; bands];
-        let mut bins = vec![0.0; bands];
-        for (k, x) in spectrum.iter().enumerate() {
-            let hz = k as f64 / (n as f64 * sample_s);
-            let Some(b) = edges_hz[..bands].iter().rposition(|start| hz >= *start) else {
-                continue;
-            };
-            let double = if k == 0 || 2 * k == n { 1.0 } else { 2.0 };
-            energy[b] += double * x.norm_sqr() / n as f64;
-            bins[b] += double * share;
-        }
+        let share = r.whitener.count() as f64 / e.len() as f64;
+        let (energy, bins) = energy_by_band(e, &edges_hz, sample_s);
         let mut cells: Vec<Cell> = (0..bands)
-            .map(|b| cell(energy[b], bins[b], sigma, 0.012, limit))
+            .map(|b| cell(energy[b], share * bins[b], sigma, 0.012, limit))
             .collect();
         cells.push(cell(
             e.iter().map(|x| x * x).sum(),

@@ -2,10 +2,11 @@
 
 use crate::fit::catalogue::Part;
 use crate::fit::context::{Context, Fit, freedom_of};
-use crate::search::cost::{price_of_waves, prior_penalty, surely_left};
+use crate::search::cost::{price_of_waves, prior_penalty, surely_left, threshold};
 use crate::search::found::Rival;
 use crate::thresholds::{NUMBER, THRESHOLDS};
 use crate::verdict::form::WithoutMemory;
+use crate::verdict::map;
 use crate::verdict::parameters::{SURE, Sureness, parameters, told};
 use crate::verdict::profile;
 use crate::verdict::result::Effect as NamedEffect;
@@ -37,6 +38,8 @@ pub(crate) struct Names {
     pub ambiguous: bool,
     /// Whether a hysteresis explains by its static curvature more than by its memory.
     pub curvature: bool,
+    /// An effect that gains no more than what is left beyond the noise may gain by chance.
+    pub drowned: Option<&'static str>,
 }
 
 /// Ids that explain the records as well in place of part `index`, and whether a record could separate them from it.
@@ -125,6 +128,7 @@ pub(crate) fn names(
         effects: Vec::new(),
         ambiguous: false,
         curvature: false,
+        drowned: None,
     };
     // A fit that leaves something over is less sure than its own curvature says.
     let left = (1.0 + ((fit.chi2 - n) / n).max(0.0)).sqrt();
@@ -166,6 +170,10 @@ pub(crate) fn names(
         let needs_text =
             !alternatives.is_empty() || effects::find(id).is_some_and(|k| k.has_doubles());
         let freedom = freedom_of(part.variant(), ctx.problem.records.len());
+        let change = apart(&without.innovations, &fit.innovations);
+        if gain < threshold(freedom) * map::left_along(ctx, fit, &change) {
+            out.drowned = Some(id);
+        }
         out.effects.push(NamedEffect {
             id: id.to_owned(),
             place: effects::find(id).map_or("camera", |k| k.spec().shown_place()),
@@ -182,6 +190,12 @@ pub(crate) fn names(
     }
     shapes::reach(ctx, fit, &sure.wide, &mut out.effects, threads);
     out
+}
+
+/// Differences row by row.
+fn apart(a: &[Vec<f64>], b: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    let rows = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).map(|(a, b)| a - b).collect();
+    a.iter().zip(b).map(rows).collect()
 }
 
 fn is_of_plays(part: &Part) -> bool {
