@@ -8,7 +8,7 @@ use crate::data::estimate::{
 use crate::data::no_response::holds;
 use crate::data::noise::NoiseModel;
 use crate::data::record::Record;
-use crate::data::repeats::{Repeats, repeats, rests, whole_periods};
+use crate::data::repeats::{Repeats, nearly_repeats, repeats, rests, whole_periods};
 use crate::data::zero_flow::descend;
 use crate::thresholds::THRESHOLDS;
 use std::ops::Range;
@@ -28,7 +28,7 @@ pub(crate) struct Floor {
 /// the difference of successive periods cancels every response that repeats; so does the difference of two records of the same
 /// command. The surely smallest estimate rules, with those that differ from it by chance: a misfit can only add, and the smallest
 /// of several uncertain ones is too small. A bead held in closed loop shows the noise by what does not follow the command. Without
-/// any estimate the model's noise is taken, unless the records are below it. Without that the floor is not known, and the increments
+/// any estimate the model's noise is taken, unless the records are below it; then what a loop's command tells that nearly repeats. Without that the floor is not known, and the increments
 /// of the residuals replace it in the figures alone.
 pub(crate) fn estimate(
     records: &[Record],
@@ -50,15 +50,18 @@ pub(crate) fn estimate(
     if found.is_empty() && walks {
         found = of_holds(records, present, residuals);
     }
-    if let Some(least) = found.iter().min_by(|a, b| a.most().total_cmp(&b.most())) {
-        let pooled = pooled(&found, least);
+    let of_measured = |found: &[Estimate]| -> Option<Floor> {
+        let least = found.iter().min_by(|a, b| a.most().total_cmp(&b.most()))?;
+        let pooled = pooled(found, least);
         let walk = NoiseModel::from_increments(pooled.c0, pooled.c1);
-        let alone = least.alone();
-        return Floor {
-            noise: choose(kind, walk, &alone).at_least(quantum_um2),
+        Some(Floor {
+            noise: choose(kind, walk, &least.alone()).at_least(quantum_um2),
             source: least.source,
             rows: pooled.rows,
-        };
+        })
+    };
+    if let Some(floor) = of_measured(&found) {
+        return floor;
     }
     let own: Vec<Estimate> = (residuals.iter().zip(present))
         .map(|(e, present)| of_increments(e, present))
@@ -88,11 +91,16 @@ pub(crate) fn estimate(
                 rows: 0,
             }
         }
-        (_, least) => Floor {
-            noise: least.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
-            source: FloorSource::Unknown,
-            rows: 0,
-        },
+        (_, least) => {
+            let of_loops = walks.then(|| of_loops(records, present, residuals));
+            of_loops
+                .and_then(|found| of_measured(&found))
+                .unwrap_or(Floor {
+                    noise: least.unwrap_or_else(|| NoiseModel::new(0.33, sample_s, 0.03)),
+                    source: FloorSource::Unknown,
+                    rows: 0,
+                })
+        }
     }
 }
 
@@ -234,6 +242,14 @@ fn of_holds(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -
     }
     found.retain(Estimate::counts);
     found
+}
+
+/// What the noise of loops is whose command comes back to itself but for their answers to the noise.
+fn of_loops(records: &[Record], present: &[Vec<bool>], residuals: &[Vec<f64>]) -> Vec<Estimate> {
+    (records.iter().zip(present).zip(residuals))
+        .filter_map(|((r, ok), e)| between_periods(r, e, ok, &nearly_repeats(r)?, true))
+        .filter(Estimate::counts)
+        .collect()
 }
 
 /// Variance that the finest step of the position column adds: a sensor that counts is never better than that.

@@ -102,6 +102,11 @@ mod tests {
 
     /// Motions whose sum is the residual, without other noise.
     fn recovered(motions: &[f64], off: bool) -> Vec<f64> {
+        recovered_beside(&RowNoise::default(), motions, off)
+    }
+
+    /// The same beside noise of single rows.
+    fn recovered_beside(beside: &RowNoise, motions: &[f64], off: bool) -> Vec<f64> {
         let mut at = 0.0;
         let residual: Vec<f64> = (motions.iter())
             .map(|m| {
@@ -112,7 +117,7 @@ mod tests {
             .collect();
         let rows = motions.len();
         let noise = noise();
-        let whitener = Whitener::new(&noise, &vec![true; rows], &RowNoise::default());
+        let whitener = Whitener::new(&noise, &vec![true; rows], beside);
         let paths = FlowPaths::new((0..rows).map(|k| k as f64).collect());
         let transients = if off { vec![paths.off.clone()] } else { vec![] };
         let free = Free::new(&noise, &whitener, &transients, &paths, &[]);
@@ -143,6 +148,31 @@ mod tests {
                 assert!((found - right).abs() < 3e-4, "{k}: {found} {right}");
             }
         }
+    }
+
+    #[test]
+    fn where_the_bead_does_not_follow_the_flow_goes_on_as_before_and_after() {
+        let rows = 20_000;
+        let stuck = 9_700..10_300;
+        let flow = |k: usize| 0.005 * (k as f64 / 1500.0).cos();
+        // The bead does not move, and that says nothing.
+        let seen: Vec<f64> = (0..rows)
+            .map(|k| if stuck.contains(&k) { 0.0 } else { flow(k) })
+            .collect();
+        let anywhere = |k: usize| if stuck.contains(&k) { 1.0 } else { 0.0 };
+        let blind = RowNoise {
+            walk: Some((0..rows).map(anywhere).collect()),
+            white: None,
+        };
+        let middle = 10_000;
+        let (told, misled) = (
+            recovered_beside(&blind, &seen, false)[middle],
+            recovered(&seen, false)[middle],
+        );
+        // Both know no more than the noise lets them.
+        let [told, misled] = [told, misled].map(|flow_um| flow_um / flow(middle));
+        assert!((0.7..1.0).contains(&told), "{told}");
+        assert!(misled < 0.5, "{misled}");
     }
 
     #[test]

@@ -35,6 +35,24 @@ pub(crate) fn whole_periods(r: &Record) -> Option<Repeats> {
     })
 }
 
+/// Where the command of a loop comes back to itself, but for what the loop answered to the noise. The linear response to that difference can be
+/// left out of an estimate of the noise.
+pub(crate) fn nearly_repeats(r: &Record) -> Option<Repeats> {
+    /// Most by which the command differs, as a part of its RMS. A response that bends by all of itself then adds at most a quarter of its
+    /// own power to the noise, and stands out from it all the same.
+    const NEAR: f64 = 0.5;
+    let power = variance(&r.pzt_um);
+    let apart = differences(&r.pzt_um);
+    let away = (apart.iter()).position(|apart| *apart > power)?;
+    // Two periods of run-in, and as much again that is used.
+    let lags = away.max(20)..r.rows() / 4;
+    let rows = lags.min_by(|a, b| apart[*a].total_cmp(&apart[*b]))?;
+    (apart[rows] <= NEAR.powi(2) * power).then(|| Repeats {
+        rows,
+        ranges: std::iter::once(2 * rows..r.rows()).collect(),
+    })
+}
+
 /// Stretches in which the command repeats itself.
 pub(crate) fn repeats(r: &Record) -> Option<Repeats> {
     let n = r.rows();

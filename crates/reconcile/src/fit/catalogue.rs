@@ -185,6 +185,12 @@ impl Part {
         }
     }
 
+    /// Whether a camera can do it: a frame is exposed until the next one at most, but for the error of an estimate.
+    pub(crate) fn is_possible(&self, scope: &Scope) -> bool {
+        const ERROR: f64 = 0.1;
+        self.averages_s(scope) <= (1.0 + ERROR) * scope.sample_s
+    }
+
     pub(crate) fn effect(&self, scope: &Scope) -> Effect {
         self.variant
             .kind

@@ -302,6 +302,11 @@ impl Context<'_> {
         self.problem.spend(work);
     }
 
+    /// Whether a rig can have all of a set.
+    pub(crate) fn is_possible(&self, fit: &Fit) -> bool {
+        fit.parts.iter().all(|p| p.is_possible(&self.scope))
+    }
+
     /// Rows of each record in which the bead follows less than half of a small change of the zero flow: it sticks, or is held.
     pub(crate) fn stops(&self, fit: &Fit) -> Vec<Vec<bool>> {
         /// Rows after which the change turns round: a leak has not yet taken it back.

@@ -101,6 +101,7 @@ pub(crate) fn extensions(
     });
     fits.extend(rest);
     fits.extend(own(ctx, fit, mask, effort, forbidden));
+    fits.retain(|f| ctx.is_possible(f));
     fits.sort_by(|a, b| penalised_cost(ctx, a).total_cmp(&penalised_cost(ctx, b)));
     fits
 }
@@ -243,7 +244,9 @@ fn replace(ctx: &Context<'_>, mut fit: Fit, mask: &Mask, effort: Effort) -> (Fit
                 };
                 ctx.fit_towards(parts, Some(fit.soft), mask, until)
             }) {
-                consider(other, i, &mut list);
+                if ctx.is_possible(&other) {
+                    consider(other, i, &mut list);
+                }
             }
             rivals.push(list);
         }

@@ -265,6 +265,13 @@ fn at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<String> {
 pub(crate) fn first_at_bound(ctx: &Context<'_>, fit: &Fit) -> Option<(usize, String)> {
     let mut at = 0;
     for (i, part) in fit.parts.iter().enumerate() {
+        if !part.is_possible(&ctx.scope) {
+            let words = format!(
+                "no camera exposes for longer than a frame, as {} would",
+                part.id()
+            );
+            return Some((i, words));
+        }
         for (j, (p, v)) in part.variant().params.iter().zip(part.natural()).enumerate() {
             let (low, high) = (p.coordinate(p.lower), p.coordinate(p.upper));
             let x = part.theta[j];
