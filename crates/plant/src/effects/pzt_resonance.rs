@@ -5,7 +5,7 @@ use super::{
     Action, Candidate, Effect, EffectKind, Experiment, Form, ParameterSpec, Place, Scope, Spec, log,
 };
 use crate::modal::Zpk;
-use std::f64::consts::TAU;
+use std::f64::consts::{FRAC_1_SQRT_2, TAU};
 
 /// Mechanical resonance: `w^2 / (s^2 + 2 zeta w s + w^2)`, undamped natural frequency and damping ratio.
 pub fn pzt_resonance(frequency_hz: f64, damping: f64) -> Effect {
@@ -40,9 +40,10 @@ impl EffectKind for PztResonance {
     }
 
     fn candidates(&self) -> &'static [Candidate] {
+        // A response that is damped more has no peak: it is that of a lag.
         const ALL: &[Candidate] = &[Candidate::chain(&[
             log("frequency_hz", 20.0, 4e4),
-            log("damping", 0.002, 0.9),
+            log("damping", 0.002, FRAC_1_SQRT_2),
         ])
         .typical(150.0, 4e4)];
         ALL

@@ -149,6 +149,24 @@ mod tests {
     }
 
     #[test]
+    fn a_sine_whose_loop_answers_the_noise_nearly_repeats() {
+        let mut random = cellpos_numeric::Random::new(5);
+        let mut loop_of = |noise: f64| -> Vec<f64> {
+            let sine = |k: u32| (std::f64::consts::TAU * f64::from(k) / 100.0).sin();
+            (0..6000)
+                .map(|k| sine(k) + noise * random.normal())
+                .collect()
+        };
+        // The difference of two rows has an RMS of twice the noise's, as a part of the sine's.
+        let r = record(&loop_of(0.1));
+        assert_eq!(whole_periods(&r), None);
+        assert_eq!(nearly_repeats(&r).unwrap().rows % 100, 0);
+        assert_eq!(nearly_repeats(&record(&loop_of(0.4))), None);
+        assert_eq!(nearly_repeats(&record(&levels(3, 6000, 4.0))), None);
+        assert_eq!(nearly_repeats(&record(&[2.0; 6000])), None);
+    }
+
+    #[test]
     fn levels_by_chance_neither_repeat_nor_rest() {
         let u = levels(3, 6000, 4.0);
         assert_eq!(repeats(&record(&u)), None);

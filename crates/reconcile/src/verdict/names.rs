@@ -97,19 +97,22 @@ fn alternatives(
     (found, open)
 }
 
-/// Whether a rival explains as much with one of its times or rates at the end of its range, where it is a simpler effect. A relaxation that
-/// takes longer than a zero flow stands still is a gain.
+/// Whether a rival explains as much with one of its times or rates at the end of its range, where it is a simpler effect, and no longer in the
+/// middle. A relaxation that takes longer than a zero flow stands still is a gain. Where the middle explains as much, the number may have most
+/// of its values, and the rival is one.
 fn ends_as_well(ctx: &Context<'_>, fit: &Fit, index: usize, rival: &Rival) -> bool {
     let before = fit.numbers_before(index);
+    let all = ctx.problem.all();
     let params = rival.part.variant().params.iter().enumerate();
     params.filter(|(_, p)| p.log).any(|(j, p)| {
-        [p.lower, p.upper].into_iter().any(|end| {
-            let mut at_end = fit.clone();
-            at_end.parts[index] = rival.part.clone();
-            at_end.parts[index].theta[j] = p.coordinate(end);
-            let all = ctx.problem.all();
-            ctx.refit_with(&at_end, &all, 8, before + j).chi2 - fit.chi2 < THRESHOLDS.tie
-        })
+        let as_well = |coordinate: f64| {
+            let mut there = fit.clone();
+            there.parts[index] = rival.part.clone();
+            there.parts[index].theta[j] = coordinate;
+            ctx.refit_with(&there, &all, 8, before + j).chi2 - fit.chi2 < THRESHOLDS.tie
+        };
+        let ends = [p.lower, p.upper].map(|end| p.coordinate(end));
+        ends.into_iter().any(as_well) && !as_well(0.5 * (ends[0] + ends[1]))
     })
 }
 
