@@ -24,12 +24,12 @@ pub(crate) struct Floor {
 
 /// Estimates both noises from residuals of the null model.
 ///
-/// A rest record shows the noise itself (lines at the mains frequency and a drift removed). If the command of a record repeats,
-/// the difference of successive periods cancels every response that repeats; so does the difference of two records of the same
-/// command. The surely smallest estimate rules, with those that differ from it by chance: a misfit can only add, and the smallest
-/// of several uncertain ones is too small. A bead held in closed loop shows the noise by what does not follow the command. Without
-/// any estimate the model's noise is taken, unless the records are below it; then what a loop's command tells that nearly repeats. Without that the floor is not known, and the increments
-/// of the residuals replace it in the figures alone.
+/// A rest record shows the noise itself (lines at the mains frequency and a drift removed). If the command of a record repeats, the
+/// difference of successive periods cancels every response that repeats; so does the difference of two records of the same command. The
+/// surely smallest estimate rules, with those that differ from it by chance: a misfit can only add, and the smallest of several uncertain
+/// ones is too small. A bead held in closed loop shows the noise by what does not follow the command. Without any estimate the model's
+/// noise is taken, unless the records are below it; then what a loop's command tells that nearly repeats. Without that the floor is not
+/// known, and the increments of the residuals replace it in the figures alone.
 pub(crate) fn estimate(
     records: &[Record],
     present: &[Vec<bool>],

@@ -35,8 +35,8 @@ pub(crate) fn whole_periods(r: &Record) -> Option<Repeats> {
     })
 }
 
-/// Where the command of a loop comes back to itself, but for what the loop answered to the noise. The linear response to that difference can be
-/// left out of an estimate of the noise.
+/// Where the command of a loop comes back to itself, but for what the loop answered to the noise. An estimate of the noise leaves out the
+/// linear response to that difference.
 pub(crate) fn nearly_repeats(r: &Record) -> Option<Repeats> {
     /// Most by which the command differs, as a part of its RMS. A response that bends by all of itself then adds at most a quarter of its
     /// own power to the noise, and stands out from it all the same.

@@ -207,9 +207,9 @@ fn refusal(ctx: &Context<'_>, e: &Evidence<'_>, closed: f64, open: bool) -> Opti
             "the best of the catalogue, {best}, explains no more than a curve of the response without memory: no name"
         ));
     }
-    if let Some(id) = e.names.drowned {
+    if let Some(id) = e.names.by_chance {
         return Some(format!(
-            "the best of the catalogue is {best}, but {id} gains no more than what is left beyond the noise may give by chance: no name"
+            "the best of the catalogue is {best}, but {id} gains no more than chance may, given what is left beyond the noise: no name"
         ));
     }
     if open && closed < THRESHOLDS.closed_least {

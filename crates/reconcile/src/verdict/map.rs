@@ -93,19 +93,21 @@ fn energy_by_band(e: &[f64], edges_hz: &[f64], sample_s: f64) -> (Vec<f64>, Vec<
     (energy, bins)
 }
 
-/// Variance of what a fit leaves along a change of the innovations, relative to that of the noise: at least 1. Each band of each record
-/// counts by what the change has there.
+/// Variance of what a fit leaves, relative to that of the noise, in the bands in which it differs from another: at least 1. Each band of each
+/// record counts by the power of the difference there.
 ///
-/// Where more than the noise is left, as beside an unknown effect or behind a noise that was stated wrongly, a change along which as much is
-/// left gains as much more by chance.
-pub(crate) fn left_along(ctx: &Context<'_>, fit: &Fit, change: &[Vec<f64>]) -> f64 {
+/// Where more than the noise is left, next to an unknown effect or under a noise that was stated wrongly, chance gains as much more.
+pub(crate) fn left_along(ctx: &Context<'_>, fit: &Fit, other: &Fit) -> f64 {
     let sample_s = ctx.problem.base.sample_s;
     let edges_hz = band_edges_hz(sample_s);
     let (mut left, mut whole) = (0.0, 0.0);
-    for ((r, e), d) in (ctx.problem.records.iter().zip(&fit.innovations)).zip(change) {
+    for (r, (e, other)) in
+        (ctx.problem.records.iter()).zip(fit.innovations.iter().zip(&other.innovations))
+    {
         let share = r.whitener.count() as f64 / e.len() as f64;
+        let change: Vec<f64> = e.iter().zip(other).map(|(e, o)| o - e).collect();
         let (energy, bins) = energy_by_band(e, &edges_hz, sample_s);
-        let (of_change, _) = energy_by_band(d, &edges_hz, sample_s);
+        let (of_change, _) = energy_by_band(&change, &edges_hz, sample_s);
         for ((energy, bins), of_change) in energy.iter().zip(&bins).zip(&of_change) {
             if *bins > 0.0 {
                 left += of_change * energy / (share * bins);

@@ -38,8 +38,8 @@ pub(crate) struct Names {
     pub ambiguous: bool,
     /// Whether a hysteresis explains by its static curvature more than by its memory.
     pub curvature: bool,
-    /// An effect that gains no more than what is left beyond the noise may gain by chance.
-    pub drowned: Option<&'static str>,
+    /// An effect that gains no more than chance may, given what the set leaves.
+    pub by_chance: Option<&'static str>,
 }
 
 /// Ids that explain the records as well in place of part `index`, and whether a record could separate them from it.
@@ -97,9 +97,9 @@ fn alternatives(
     (found, open)
 }
 
-/// Whether a rival explains as much with one of its times or rates at the end of its range, where it is a simpler effect, and no longer in the
-/// middle. A relaxation that takes longer than a zero flow stands still is a gain. Where the middle explains as much, the number may have most
-/// of its values, and the rival is one.
+/// Whether a rival explains as much with one of its times or rates at the end of its range, where it is a simpler effect, and less in the
+/// middle of it. A relaxation that takes longer than a zero flow stands still is a gain. A number that may be anything from the middle to the
+/// end belongs to a rival.
 fn ends_as_well(ctx: &Context<'_>, fit: &Fit, index: usize, rival: &Rival) -> bool {
     let before = fit.numbers_before(index);
     let all = ctx.problem.all();
@@ -131,7 +131,7 @@ pub(crate) fn names(
         effects: Vec::new(),
         ambiguous: false,
         curvature: false,
-        drowned: None,
+        by_chance: None,
     };
     // A fit that leaves something over is less sure than its own curvature says.
     let left = (1.0 + ((fit.chi2 - n) / n).max(0.0)).sqrt();
@@ -173,9 +173,8 @@ pub(crate) fn names(
         let needs_text =
             !alternatives.is_empty() || effects::find(id).is_some_and(|k| k.has_doubles());
         let freedom = freedom_of(part.variant(), ctx.problem.records.len());
-        let change = apart(&without.innovations, &fit.innovations);
-        if gain < threshold(freedom) * map::left_along(ctx, fit, &change) {
-            out.drowned = Some(id);
+        if gain < threshold(freedom) * map::left_along(ctx, fit, &without) {
+            out.by_chance = Some(id);
         }
         out.effects.push(NamedEffect {
             id: id.to_owned(),
@@ -193,12 +192,6 @@ pub(crate) fn names(
     }
     shapes::reach(ctx, fit, &sure.wide, &mut out.effects, threads);
     out
-}
-
-/// Differences row by row.
-fn apart(a: &[Vec<f64>], b: &[Vec<f64>]) -> Vec<Vec<f64>> {
-    let rows = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).map(|(a, b)| a - b).collect();
-    a.iter().zip(b).map(rows).collect()
 }
 
 fn is_of_plays(part: &Part) -> bool {
