@@ -6,8 +6,11 @@
 
 use crate::closed_loop::{DELAY_S, Flow, Hidden, closed_loop, run_from, survey};
 use cellpos_numeric::Random;
-use cellpos_plant::{Effect, effects};
-use cellpos_reconcile::{Options, Reconciliation, Record, Verdict};
+use cellpos_plant::{Effect, Model, Noise, effects};
+use cellpos_reconcile::{
+    FloorSource, NoiseKind, Options, Reconciliation, Record, Verdict, reconcile,
+};
+use std::f64::consts::TAU;
 
 const ROWS: [Hidden; 29] = [
     Hidden::Nothing,
@@ -154,6 +157,37 @@ fn a_pump_is_told_by_its_strokes_in_a_short_record_beside_a_delay_that_is_known(
     let rest_um = rest_um(&record);
     let r = run_from(record, rest_um, &options, vec![delay]);
     assert!(row(pump, &r));
+}
+
+#[test]
+#[ignore = "nightly: 10 s of a release build"]
+fn a_sine_whose_command_answers_the_noise_tells_the_noise_of_a_hold() {
+    // Lines that are no multiples of the sine's stand for the answers: from period to period the command differs by a fifth.
+    fn sine(now_s: f64) -> f64 {
+        let answers = [6.18, 14.14, 17.32, 22.36].map(|hz| (hz, 0.018));
+        let line = |(hz, size_um): (f64, f64)| size_um * (TAU * hz * now_s).sin();
+        line((10.0, 0.25)) + answers.into_iter().map(line).sum::<f64>()
+    }
+    let noise_of = |added: fn(f64) -> f64, source: FloorSource| {
+        let record = closed_loop(flow_of(911), Hidden::Gain(0.8), added, 911);
+        let model = Model {
+            working_point_um: rest_um(&record),
+            noise: Noise::NONE,
+            ..Model::eq6()
+        };
+        let options = Options {
+            free_working_point: true,
+            max_effects: 1,
+            noise: NoiseKind::Walk,
+            ..Options::default()
+        };
+        let r = reconcile(&model, &[record], &options, &mut |_| {}).unwrap();
+        assert_eq!(r.floor, source);
+        r.noise.innovation_um()
+    };
+    let hold = noise_of(|_| 0.0, FloorSource::Rest);
+    let driven = noise_of(sine, FloorSource::Periods);
+    assert!((driven / hold - 1.0).abs() < 0.03, "{driven} {hold}");
 }
 
 #[test]
